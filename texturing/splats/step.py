@@ -106,7 +106,7 @@ def splats(inputs: Inputs, params: SplatsParams, out: Path, report: Report, chec
     _train(
         training, seen, Schedule(params.epochs, cover=params.cover, depth=params.depth, seed=params.seed), state, report
     )
-    result = _within_cell(training.result(), params.context)
+    result = _within_cell(training.result(seen), params.context)
     SplatLayer(result, training.background.texture, *training.photos(seen)).save(out / SPLATS_FILE)
     metrics = {
         "photos": len(excluded), "first": first, "splats": len(result), "rendered": backend.description()
@@ -205,4 +205,4 @@ def can_train(params: SplatsParams) -> None:
 
 
 # photos take 30 MB for each megapixel, whatever the size of their files, and are 100 at most by default
-SPLATS = Step("splats", 3, splats, SplatsParams, check=can_train, resumes=True, memory=(4.5, 3))
+SPLATS = Step("splats", 4, splats, SplatsParams, check=can_train, resumes=True, memory=(4.5, 3))

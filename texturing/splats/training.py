@@ -25,7 +25,7 @@ from scan2sim.pipeline.core.splats import (
     VIGNETTING,
     Splats,
 )
-from scan2sim.pipeline.core.types import F32
+from scan2sim.pipeline.core.types import F32, F64
 from scan2sim.texturing.splats import loss
 from scan2sim.texturing.splats.backends import Backend, Rendered, cpu
 from scan2sim.texturing.splats.background import Background
@@ -42,6 +42,9 @@ GAIN_RATE = 0.2
 """Share by which a photo's gain moves to the solution at every visit but the first."""
 MIN_OPACITY = 0.02
 """Splats that end below it are removed."""
+MIN_WEIGHT_PX, WEIGHED_SIZE = 0.05, 1
+"""Pixels of all photos together, in the size with this index, that a splat must cover to be kept: what no photo shows,
+as it is behind its camera or hidden, would be a haze in other views."""
 
 
 @dataclass(frozen=True)
@@ -152,10 +155,23 @@ class Training:
             row[GAIN], row[OFFSET], row[VIGNETTING] = response.gain, response.offset, shot.exposure[3:]
         return rows, cameras
 
-    def result(self) -> Splats:
-        """The splats that are visible."""
+    def result(self, shots: Sequence[Shot]) -> Splats:
+        """The splats that the shots show."""
         parameters = self.descent.parameters
-        return Splats(parameters[parameters[:, LOGIT] > math.log(MIN_OPACITY / (1 - MIN_OPACITY))])
+        opaque = parameters[:, LOGIT] > math.log(MIN_OPACITY / (1 - MIN_OPACITY))
+        return Splats(parameters[opaque & (self._weights(shots) > MIN_WEIGHT_PX)])
+
+    def _weights(self, shots: Sequence[Shot]) -> F64:
+        """(N,) pixels that each splat covers in the shots, where these are compared, times its share of their light."""
+        total = np.zeros(len(self.descent.parameters))
+        for shot in shots:
+            level = shot.levels[WEIGHED_SIZE]
+            drawn, behind = self.rendered(level)
+            red = np.zeros((*level.used.shape, 3), np.float32)
+            red[..., 0] = level.used
+            # the image is the sum of the splats' colours times their weights: by a colour, its derivative is the weight
+            total[drawn.seen] += drawn.gradients(behind, red)[:, RGB][:, 0]
+        return total
 
     def _check(self) -> None:
         """Check that all parameters are finite.

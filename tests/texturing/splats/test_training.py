@@ -10,11 +10,12 @@ import pytest
 from scan2sim.pipeline.camera.models import pixel_rays
 from scan2sim.pipeline.camera.renderer import Body, Renderer, look_at, pinhole
 from scan2sim.pipeline.core.errors import StepError
-from scan2sim.pipeline.core.splats import AXIS, GAIN, SplatLayer
+from scan2sim.pipeline.core.splats import AXIS, GAIN, LOG_SCALE, SplatLayer
 from scan2sim.pipeline.core.types import Camera, View
 from scan2sim.texturing.backdrop.photos import Photo
 from scan2sim.texturing.photo_cache import camera_of
 from scan2sim.texturing.splats import background, rasterizer, start
+from scan2sim.texturing.splats.descent import Descent
 from scan2sim.texturing.splats.exposure import Gains, Response, falloff
 from scan2sim.texturing.splats.projection import Pinhole
 from scan2sim.texturing.splats.shots import SCALES, Shot, shots
@@ -69,8 +70,13 @@ def trained(photos: list[Photo], schedule: Schedule = SCHEDULE) -> tuple[Trainin
 
 
 @pytest.fixture(scope="module")
-def corner() -> Training:
-    return trained([photo(pose, name=str(i)) for i, pose in enumerate(PATH)])[0]
+def street() -> tuple[Training, list[Shot]]:
+    return trained([photo(pose, name=str(i)) for i, pose in enumerate(PATH)])
+
+
+@pytest.fixture(scope="module")
+def corner(street: tuple[Training, list[Shot]]) -> Training:
+    return street[0]
 
 
 def psnr(training: Training, pose: np.ndarray) -> float:
@@ -117,7 +123,7 @@ def test_photos_of_other_exposures_are_shown_by_their_corrections() -> None:
     training, seen = trained(taken)
     bright, dark = (training.gains.gain[first::2].mean() for first in (0, 1))
     assert dark / bright == pytest.approx(1, abs=0.05)
-    layer = SplatLayer(training.result(), training.background.texture, *training.photos(seen))
+    layer = SplatLayer(training.result(seen), training.background.texture, *training.photos(seen))
     bright, dark = (layer.photos[first::2, GAIN].mean() for first in (0, 1))
     assert dark / bright == pytest.approx(np.exp(-0.25), abs=0.05)
     errors = []
@@ -224,9 +230,10 @@ def test_a_training_continues_where_it_was_saved(tmp_path: Path) -> None:
     assert np.array_equal(loaded.background.texture, whole.background.texture)
 
 
-def test_surfaces_are_covered_from_the_side(corner: Training) -> None:
+def test_surfaces_are_covered_from_the_side(street: tuple[Training, list[Shot]]) -> None:
+    training, seen = street
     aside = look_at((-3.5, 2.5, 1.4), (0.5, 0, 0.5))
-    drawn = rasterizer.render(corner.result().parameters, Pinhole.of(CAMERA, aside))
+    drawn = rasterizer.render(training.result(seen).parameters, Pinhole.of(CAMERA, aside))
     hit = Renderer([Body(GROUND), Body(BOX)]).view(CAMERA, aside).hit
     assert (1 - drawn.transmittance)[hit].mean() > 0.9
 
@@ -243,3 +250,25 @@ def test_the_exposure_of_the_world_changes_without_changing_renderings(corner: T
     assert np.allclose(before, after, atol=1e-5)
     assert np.allclose(np.log(gains.gain).mean(axis=0), 0, atol=1e-5)
     assert np.allclose(gains.offset.mean(axis=0), 0, atol=1e-5)
+
+
+def test_what_no_photo_shows_is_left_out() -> None:
+    """A large splat behind all cameras, and one inside the ground: haze in the view of who stands farther back."""
+    training, seen = begun([photo(pose, name=str(i)) for i, pose in enumerate(PATH)])
+    shown = len(training.result(seen))
+    assert shown > 0.9 * len(training.descent.parameters)
+    unseen = training.descent.parameters[:2].copy()
+    unseen[:, :3] = (-6.5, 0, 1.8), (0, -1.5, -2)
+    unseen[:, LOG_SCALE] = np.log(0.5)
+    grown = Training(
+        Descent(np.concatenate([training.descent.parameters, unseen]), np.ones(2 + len(training.descent.parameters))),
+        training.background, training.gains,
+    )  # fmt: skip
+    assert len(grown.result(seen)) == shown
+    back = look_at((-8.5, 0, 1.8), (0, 0, 0.6))
+    (shot,) = shots_of(photo(back))
+    clear, hazy = (
+        rasterizer.render(one, shot.levels[-1].camera).over(np.ones((*shot.rgb.shape,), np.float32))
+        for one in (grown.result(seen).parameters, grown.descent.parameters)
+    )
+    assert np.abs(clear - hazy).mean() > 0.05
