@@ -9,6 +9,7 @@ meshed, but still occlude what is behind them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -89,8 +90,12 @@ FIRST_USER_CODE = 64
 def code_of(text: str) -> int | None:
     """Code of a class given by name ("Road sign"; case and spaces don't matter) or by code ("64"); None if unknown."""
     plain = _plain(text)
-    names = {_plain(name): code for name, code in (SYNONYMS | CODE).items()}
-    return names.get(plain, int(plain) if plain in map(str, CODE.values()) else None)
+    return _codes_by_name().get(plain, int(plain) if plain in map(str, CODE.values()) else None)
+
+
+@cache
+def _codes_by_name() -> dict[str, int]:
+    return {_plain(name): code for name, code in (SYNONYMS | CODE).items()}
 
 
 def name_of(code: int) -> str:

@@ -55,9 +55,16 @@ class Page:
                 assert "error" not in message, message
                 return dict(message["result"])
 
-    def open(self, path: Path, *, phone: bool = False, dark: bool = False) -> None:
-        """Open a file by its file:// URL, emulating a phone or a dark colour scheme, and wait until it is loaded."""
-        width, height = (390, 844) if phone else (1280, 800)
+    def open(self, path: Path, *, phone: bool = False, dark: bool = False, size: tuple[int, int] = (1280, 800)) -> None:
+        """Open a file by its file:// URL, emulating a phone or a dark colour scheme, and wait until it is loaded.
+
+        Args:
+            path: the file.
+            phone: emulate a phone.
+            dark: emulate a dark colour scheme.
+            size: width and height of the window in pixels, except of a phone.
+        """
+        width, height = (390, 844) if phone else size
         self.do("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
         self.do("Emulation.setTouchEmulationEnabled", enabled=phone)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}

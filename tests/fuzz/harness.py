@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import os
 import select
 import subprocess
 import sys
@@ -24,6 +25,8 @@ ROOT = Path(__file__).resolve().parents[2]
 VALID_CODES = {0, *(code for code, _, _ in EXIT_CODES.values())}
 MAX_SECONDS, MAX_MEGABYTES = 10.0, 2000.0
 """Limits per case: processor time, and memory of the whole process, libraries included."""
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""Environment of the child: the files are too small for several threads."""
 HANG_TIMEOUT_S = 120.0
 """A child that doesn't answer within this time hangs, even on a busy machine."""
 
@@ -58,7 +61,10 @@ class Child:
         process = self._process
         if process is None:
             command = [sys.executable, "-c", "from tests.fuzz.child import main; main()"]
-            process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT,
+                env=os.environ | ONE_THREAD,
+            )  # fmt: skip
             self._process = process
         assert process.stdin and process.stdout
         process.stdin.write(json.dumps({"kind": kind, "folder": str(folder)}) + "\n")

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("steps_in_process")
 
 LOW, HIGH = np.array([-8.0, -6.0, 0.0]), np.array([30.0, 6.0, 5.0])  # the hall
 PAINT = np.array([[250, 30, 30], [30, 250, 30], [30, 30, 250], [250, 250, 30], [30, 250, 250], [250, 30, 250]])
-PERIOD, SWEEPS, SPEED, TURN = 0.1, 6, 9.0, 0.4
+PERIOD, SWEEPS, COLUMNS, SPEED, TURN = 0.1, 6, 600, 9.0, 0.4
 CAMERA = Camera("equirectangular", 512, 256)
 T_CAMERA_SCANNER = np.eye(4)
 T_CAMERA_SCANNER[:3, :3] = Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix() @ [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
@@ -57,10 +57,10 @@ def intersect(origin: F64, direction: F64) -> tuple[F64, np.ndarray]:
     return origin + direction * far.min(axis=1)[:, None], wall
 
 
-def sweep(time: float, *, turning: bool) -> F64:
+def sweep(time: float, *, turning: bool, columns: int = COLUMNS) -> F64:
     """(N, 3) in scanner axes, measured while it turns clockwise, from back to back, or all at once."""
-    columns = np.pi - (np.arange(600) + 0.5) / 600 * 2 * np.pi
-    azimuth, elevation = (a.ravel() for a in np.meshgrid(columns, np.radians(np.linspace(-60, 50, 24))))
+    angles = np.pi - (np.arange(columns) + 0.5) / columns * 2 * np.pi
+    azimuth, elevation = (a.ravel() for a in np.meshgrid(angles, np.radians(np.linspace(-60, 50, 24))))
     flat = np.cos(elevation)
     ray = np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], axis=1)
     when = time + (-azimuth / (2 * np.pi) * PERIOD if turning else np.zeros(len(ray)))
@@ -121,15 +121,16 @@ class Drive:
 
 
 def make(
-    folder: Path, *, turning: bool = False, write: Callable[[Path, F64], None] = to_bin, shift: Any = (0, 0, 0)
-) -> Drive:
-    times = 0.1 + PERIOD * np.arange(SWEEPS, dtype=float)
+    folder: Path, *, turning: bool = False, write: Callable[[Path, F64], None] = to_bin, shift: Any = (0, 0, 0),
+    sweeps: int = SWEEPS, columns: int = COLUMNS,
+) -> Drive:  # fmt: skip
+    times = 0.1 + PERIOD * np.arange(sweeps, dtype=float)
     for name in ("sweeps", "photos"):
         (folder / name).mkdir(parents=True)
     scanner = scanner_path(times)
     poses = scanner.poses @ np.linalg.inv(T_CAMERA_SCANNER)
     for i, time in enumerate(times):
-        write(folder / "sweeps" / f"{i:06d}", sweep(float(time), turning=turning))
+        write(folder / "sweeps" / f"{i:06d}", sweep(float(time), turning=turning, columns=columns))
         cv2.imwrite(str(folder / "photos" / f"{i:06d}.png"), photo(poses[i])[..., ::-1])
     camera = Trajectory(times, poses[:, :3, 3] + shift, poses[:, :3, :3])
     trajectory_io.write(folder / "camera.csv", camera)

@@ -16,9 +16,10 @@ from scan2sim.pipeline.steps.poisson import POISSON, Problem
 from scan2sim.pipeline.tiling.surface_blocks import Block, Surface, partition, stitch
 from tests.fakes.steps import step_params
 
-FRAME = Frame("EPSG:32633", (500001.0, 5400001.0, 200.0))
-SIZE, VOXEL = 30.0, 0.1
-CRACK_FREE_M = 14.0
+FRAME = Frame("EPSG:32633", (500000.2, 5400000.2, 200.0))
+SIZE, VOXEL = 26.4, 0.1
+BLOCK_POINTS = 25_000
+CRACK_FREE_M = 12.2
 """Half the width of the part of the ground in which no edge may be open."""
 
 
@@ -28,7 +29,7 @@ def height(xy: F64) -> F64:
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An undulating ground of 30 m with one point per voxel, 5 mm of noise, and true normals."""
+    """An undulating ground of 26 m with one point per voxel, 5 mm of noise, and true normals."""
     random = np.random.default_rng(0)
     steps = np.arange(-SIZE / 2, SIZE / 2, VOXEL) + VOXEL / 2
     xy = np.stack(np.meshgrid(steps, steps), axis=2).reshape(-1, 2)
@@ -51,7 +52,7 @@ def reconstruct(cloud: Path, out: Path, **settings: Any) -> tuple[Done, Mesh]:
 @pytest.fixture(scope="module")
 def in_blocks(cloud: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Done, Mesh]:
     """The ground in four blocks, on two cores."""
-    return reconstruct(cloud, tmp_path_factory.mktemp("blocks"), block_points=30_000, threads=2)
+    return reconstruct(cloud, tmp_path_factory.mktemp("blocks"), block_points=BLOCK_POINTS, threads=2)
 
 
 def open_edges(mesh: Mesh) -> F64:
@@ -71,7 +72,7 @@ def on_ground(mesh: Mesh) -> F64:
 def test_result_is_byte_identical_on_any_number_of_threads(
     cloud: Path, in_blocks: tuple[Done, Mesh], tmp_path: Path, threads: int
 ) -> None:
-    done, _ = reconstruct(cloud, tmp_path, block_points=30_000, threads=threads)
+    done, _ = reconstruct(cloud, tmp_path, block_points=BLOCK_POINTS, threads=threads)
     assert done.metrics["blocks"] == 4
     assert done.files["mesh"].read_bytes() == in_blocks[0].files["mesh"].read_bytes()
 
@@ -149,7 +150,7 @@ def test_crashed_block_is_retried_and_then_coarsened(
         return real(target, problems, *args, **kwargs)
 
     monkeypatch.setattr(sandbox, "call", flaky)
-    done, mesh = reconstruct(cloud, tmp_path, block_points=30_000, threads=1)
+    done, mesh = reconstruct(cloud, tmp_path, block_points=BLOCK_POINTS, threads=1)
     depth = calls[0][1]
     assert calls == [(4, depth), (1, depth), (1, depth - 1), (1, depth), (1, depth), (1, depth)]
     assert len(done.warnings) == 2 and done.metrics["cell_m"] == pytest.approx(0.2)
