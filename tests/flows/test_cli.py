@@ -39,8 +39,8 @@ SMALL = [f"--set={name}" for name in (
 
 @pytest.fixture(scope="module")
 def street(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small street with a quarter of its points and half of its photos."""
-    return tiny(small_street, tmp_path_factory.mktemp("street") / "tile", every=4, photos=4)
+    """The small street with a quarter of its points and half of its photos, of half their size."""
+    return tiny(small_street, tmp_path_factory.mktemp("street") / "tile", every=4, photos=4, photo_scale=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +77,7 @@ def test_run_publishes_its_progress_on_the_bus(
     assert all("cached" in states for states in steps.values()) and "preview" in steps
 
 
+@inline_steps()
 def test_rasters_are_built_only_if_requested(street: Path, world: Path, tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio", reason="rasterio isn't installed")
     out = shutil.copytree(world, tmp_path / "out")
@@ -143,9 +144,8 @@ def test_report_without_webgl_shows_the_image_and_the_reason(world: Path, tmp_pa
         assert page.errors == []
 
 
-def test_unencodable_characters_are_printed_as_question_marks(tmp_path: Path) -> None:
-    tile = tmp_path / "straße\u2026"
-    shutil.copytree(ROOT / "data_samples" / "tile", tile)
+def test_unencodable_characters_are_printed_as_question_marks(street: Path, tmp_path: Path) -> None:
+    tile = shutil.copytree(street, tmp_path / "straße\u2026")
     command = [sys.executable, "-m", "scan2sim.flows.cli", "inspect", str(tile)]
     run = subprocess.run(command, env=os.environ | {"PYTHONIOENCODING": "latin-1"}, cwd=ROOT, capture_output=True)
     assert run.returncode == 0, run.stderr

@@ -24,8 +24,8 @@ FAST = options(COARSE | {"export": {}})
 
 @pytest.fixture(scope="module")
 def street(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The small street with a tenth of its points and half of its photos."""
-    return tiny(small_street, tmp_path_factory.mktemp("street") / "tile", photos=4)
+    """The small street with a tenth of its points and half of its photos, of half their size."""
+    return tiny(small_street, tmp_path_factory.mktemp("street") / "tile", photos=4, photo_scale=0.5, truth=False)
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,15 @@ def world(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def without_last_steps(world: Path, out: Path, first: str) -> None:
+    """Copy a finished run without the result of a step and those of all steps that ended later."""
+    shutil.copytree(world, out, symlinks=True)
+    ended = {path.parent: path.stat().st_mtime_ns for path in (out / "steps").glob("*/*/manifest.json")}
+    since = min(time for folder, time in ended.items() if folder.parent.name == first)
+    for step in {folder.parent for folder, time in ended.items() if time >= since}:
+        shutil.rmtree(step)
+
+
 def flip(path: Path, *, hide: bool = False) -> None:
     """Flip a bit in the middle of a file; with `hide`, restore its modification time."""
     stat, data = path.stat(), bytearray(path.read_bytes())
@@ -46,6 +55,7 @@ def flip(path: Path, *, hide: bool = False) -> None:
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
+@inline_steps()
 def test_damaged_results_are_reported_and_rebuilt(street: Path, world: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(world, out, symlinks=True)
@@ -101,10 +111,12 @@ def test_full_disk_is_a_space_error(small_street: Path, tmp_path: Path, megabyte
         subprocess.run(["umount", "--lazy", str(mount)], check=True)
 
 
-def test_ctrl_c_prints_a_message_and_releases_the_lock(street: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "scan2sim.flows.cli", "run", str(street), "--out", str(tmp_path / "out"), *FAST]
-    child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def test_ctrl_c_prints_a_message_and_releases_the_lock(street: Path, world: Path, tmp_path: Path) -> None:
     started = tmp_path / "out" / "steps" / "poisson.terrain"
+    without_last_steps(world, tmp_path / "out", started.name)
+    arguments = ["run", str(street), "--out", str(tmp_path / "out"), "--hold-out", "2", *FAST]
+    command = [sys.executable, "-m", "scan2sim.flows.cli", *arguments]
+    child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     until(lambda: child.poll() is not None or started.exists(), 240, what="the step")
     child.send_signal(signal.SIGINT)
     _, message = child.communicate()
@@ -136,7 +148,8 @@ def test_resume_after_sigkill_gives_identical_textures(
     child.wait()
     until(lambda: not processes("RUN_TO_KILL", str(tmp_path)), what="the end of all its processes")
     finished = {p.parent.name for p in (tmp_path / "out" / "steps").glob("*/*") if not p.name.startswith(".tmp-")}
-    out = stdout_of(in_process(*arguments))
+    with inline_steps():
+        out = stdout_of(in_process(*arguments))
     again = {line.split()[1] for line in out.splitlines() if line.startswith("✓")}
     assert not finished & again, "finished steps are not repeated"
     assert (tmp_path / "out" / "report.html").is_file()

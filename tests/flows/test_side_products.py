@@ -91,7 +91,7 @@ def scan2sim(
 
 @pytest.fixture(scope="module")
 def street(small_street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tiny(small_street, tmp_path_factory.mktemp("tiny") / "tile")
+    return tiny(small_street, tmp_path_factory.mktemp("tiny") / "tile", photo_scale=0.5, truth=False)
 
 
 @pytest.fixture(scope="module")

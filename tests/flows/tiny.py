@@ -14,17 +14,19 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import tomli_w
 
 from scan2sim.flows import cli
 from scan2sim.flows.pipelines import tile as tile_pipeline
 from scan2sim.pipeline.core.plugins import find
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report
-from scan2sim.pipeline.core.types import Bools, PointCloud
-from scan2sim.pipeline.io import world_formats
+from scan2sim.pipeline.core.types import Bools, Camera, PointCloud
+from scan2sim.pipeline.io import toml, world_formats
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.io.tile import CameraEntry, camera_entry, camera_of, read_tile
 from scan2sim.pipeline.io.world_formats import gazebo
 from scan2sim.pipeline.io.worlds import readme
 from scan2sim.pipeline.io.worlds.scene import Scene, read_scene
@@ -40,13 +42,40 @@ COARSE: dict[str, dict[str, Any]] = {
 }
 
 
-def tiny(street: Path, out: Path, every: int = 10, photos: int = 2) -> Path:
-    """Write a copy of a generated street with every Nth of its points and its first photos."""
+def tiny(
+    street: Path, out: Path, every: int = 10, photos: int = 2, *, photo_scale: float = 1.0, truth: bool = True
+) -> Path:
+    """Write a copy of a generated street with every Nth of its points and its first photos.
+
+    Args:
+        street: folder of the generated street.
+        out: folder of the copy.
+        every: one of this many points is kept.
+        photos: number of photos.
+        photo_scale: size of the photos relative to the original ones; scoring them takes longest of all steps.
+        truth: whether the copy has the ground truth, which takes seconds to compare.
+    """
     shutil.copytree(street, out)
-    text = (out / "tile.toml").read_text(encoding="utf-8").split("[[photos]]")
-    (out / "tile.toml").write_text("[[photos]]".join(text[: photos + 1]), encoding="utf-8")
+    tile = toml.table(out / "tile.toml")
+    tile["photos"] = tile["photos"][:photos]
+    if not truth:
+        del tile["truth"]
+    if photo_scale != 1:
+        cameras = {entry["id"]: camera_of(out, CameraEntry(**entry)) for entry in tile["cameras"]}
+        cameras = {name: camera.scaled(photo_scale) for name, camera in cameras.items()}
+        tile["cameras"] = [camera_entry(name, camera) for name, camera in cameras.items()]
+        for photo in tile["photos"]:
+            resize(out / photo["file"], cameras[photo["camera"]])
+    (out / "tile.toml").write_text(tomli_w.dumps(tile), encoding="utf-8")
     keep_points(out, np.arange(len(points(out))) % every == 0)
     return out
+
+
+def resize(photo: Path, camera: Camera) -> None:
+    """Resize a photo to the size of a camera."""
+    pixels = cv2.imread(str(photo))
+    assert pixels is not None
+    cv2.imwrite(str(photo), cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
 
 
 def points(tile: Path) -> PointCloud:

@@ -42,7 +42,9 @@ QUIET = {
     "PYTHONUTF8": "1",  # its command prints characters that other encodings can't represent
     # by default, runs of a new schedule are created once per minute, except for new deployments
     "PREFECT_SERVER_SERVICES_SCHEDULER_LOOP_SECONDS": "2",
-    # what no test looks at: late, paused and cancelling runs, states of tasks, types of blocks
+    "PREFECT_SERVER_SERVICES_SCHEDULER_MAX_RUNS": "5",  # of a schedule; by default, a hundred are created
+    # what no test looks at: logs, late, paused and cancelling runs, states of tasks, types of blocks
+    "PREFECT_LOGGING_TO_API_ENABLED": "false",
     "PREFECT_SERVER_SERVICES_LATE_RUNS_ENABLED": "false",
     "PREFECT_SERVER_SERVICES_PAUSE_EXPIRATIONS_ENABLED": "false",
     "PREFECT_SERVER_SERVICES_CANCELLATION_CLEANUP_ENABLED": "false",
@@ -63,6 +65,8 @@ for command in json.loads(sys.argv[1]):
 """Script that runs several commands of `prefect`, which takes seconds to import, until one fails."""
 DATABASE = "prefect.db"
 """Name of Prefect's SQLite database in its home folder."""
+API_PAUSE_S = 0.5
+"""Longest pause between two calls of the API that wait for a state; each call keeps the server busy for a moment."""
 ENDED = ("COMPLETED", "FAILED", "CRASHED", "CANCELLED")
 
 
@@ -218,7 +222,7 @@ class Server:
             now = self.api("GET", f"/flow_runs/{run}")["state"]
             return now if now["type"] in ENDED else None
 
-        return until(state, seconds, what=f"run {run}")
+        return until(state, seconds, what=f"run {run}", max_pause=API_PAUSE_S)
 
 
 @contextmanager

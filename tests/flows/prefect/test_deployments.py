@@ -16,7 +16,7 @@ from scan2sim.flows.engine.versions import check_version, versions
 from scan2sim.pipeline.core.errors import IncompleteError, UnavailableError, exit_code
 from tests.conftest import ROOT
 from tests.fakes.ports import free_port
-from tests.flows.prefect.conftest import NewDatabase, Server, kill, on, serving
+from tests.flows.prefect.conftest import API_PAUSE_S, NewDatabase, Server, kill, on, serving
 from tests.flows.prefect.toy_steps import planned
 from tests.flows.processes import processes
 from tests.waiting import until
@@ -73,7 +73,7 @@ def test_server_accepts_all_deployments_and_automations(toys: Server) -> None:
     assert nightly["parameters"]["source"] == "/data/drive" and nightly["parameters"]["out"] == "/data/worlds"
     assert nightly["global_concurrency_limit"]["limit"] == 1
     assert nightly["concurrency_options"]["collision_strategy"] == "CANCEL_NEW"
-    due = until(lambda: server.runs(nightly, "SCHEDULED"), 30, what="a run that is scheduled")
+    due = until(lambda: server.runs(nightly, "SCHEDULED"), 30, what="a run that is scheduled", max_pause=API_PAUSE_S)
     assert {datetime.fromisoformat(run["expected_start_time"]).strftime("%H:%M %z") for run in due} == {"02:00 +0000"}
     assert len(server.api("POST", "/automations/filter", {})) == 2
 
@@ -88,7 +88,7 @@ def test_scheduled_run_is_executed_without_overlap(toys: Server, folder: Path) -
         (first,) = toys.runs(nightly, "RUNNING")
         state = toys.ended(toys.run(other, **parameters))
         assert state["name"] == "Skipped" and "another run is using this folder" in state["message"]
-        until(lambda: toys.runs(nightly, "CANCELLED"), 200, what="a cancelled run")
+        until(lambda: toys.runs(nightly, "CANCELLED"), 200, what="a cancelled run", max_pause=API_PAUSE_S)
     (folder / "gate").touch()
     state = toys.ended(first["id"])
     assert (state["type"], state["message"]) == ("COMPLETED", "total 4")
@@ -97,7 +97,7 @@ def test_scheduled_run_is_executed_without_overlap(toys: Server, folder: Path) -
 
     with toys.scheduled(nightly, parameters, cron="0 2 * * *", timezone="Etc/UTC"):
         # with SQLAlchemy 2.1 and PostgreSQL, this run never appeared
-        until(lambda: toys.runs(nightly, "SCHEDULED"), what="a run at two")
+        until(lambda: toys.runs(nightly, "SCHEDULED"), what="a run at two", max_pause=API_PAUSE_S)
 
 
 @on("sqlite")
@@ -155,12 +155,14 @@ def test_run_of_a_killed_worker_is_detected_and_rescheduled(
         with server.worker("toys") as worker:
             run = server.run(deployment, folder=str(folder), gate=str(folder / "gate"))
             until((folder / "started").exists, 200, what="its first step")
-            until(lambda: server.heartbeats(run), what="its first heartbeat")
+            until(lambda: server.heartbeats(run), what="its first heartbeat", max_pause=API_PAUSE_S)
             kill(worker)
         for pid in processes("PREFECT__FLOW_RUN_ID", run):
             os.kill(pid, signal.SIGKILL)
         assert server.api("GET", f"/flow_runs/{run}")["state"]["type"] == "RUNNING"
         assert server.ended(run)["type"] == "CRASHED"
-        (again,) = until(lambda: server.runs(deployment, "SCHEDULED"), 30, what="a run in ten minutes")
+        (again,) = until(
+            lambda: server.runs(deployment, "SCHEDULED"), 30, what="a run in ten minutes", max_pause=API_PAUSE_S
+        )
         ahead = datetime.fromisoformat(again["expected_start_time"]) - datetime.now().astimezone()
         assert timedelta(minutes=8) < ahead < timedelta(minutes=11)

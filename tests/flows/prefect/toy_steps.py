@@ -25,7 +25,7 @@ if TOYS in os.environ:
 class SlowParams(ToyParams):
     """A toy step that takes `seconds` and then waits until the file `gate` exists before it logs its run."""
 
-    seconds: float = 0.3
+    seconds: float = 0.05
     gate: Path | None = None
 
 
