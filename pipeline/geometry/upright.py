@@ -55,6 +55,16 @@ class UprightModel:
     """Weight of the map's z or y axis in the choice of the sign."""
     floor_share: float = 0.01
     """Share of all points in a level layer from which it is a floor or ceiling."""
+    ground_points_min: float = 0.2
+    """Share of all points in level layers from which these are ground outdoors, however far away, ..."""
+    ground_width_min_m: float = 30.0
+    """... if it is as wide as this."""
+    step_m: tuple[float, float, float] = (0.5, 0.5, 0.25)
+    """Voxels of level surfaces, of which neighbouring ones belong to one surface."""
+    furniture_max_m: float = 7.0
+    """Width up to which a level surface may be furniture, ..."""
+    furniture_share_max: float = 0.5
+    """... if it is no wider than this share of the map."""
     around_start_m: float = 10.0
     sensor_height_max_m: float = 1.9
     """Height of the sensor above the floor up to which a single level layer is a floor without doubt."""
@@ -298,10 +308,14 @@ def _sign(up: F64, flat: _Flat, points: F64, origin: F64) -> tuple[float, bool]:
     Outdoors, almost everything is above the ground. The sensor starts nearer to the floor than to the ceiling, or to
     the top of what is around it, and furniture stands on the floor. Without such evidence, the axes decide: z up, or
     LOAM's y up. They also decide if there is one level layer, further from the sensor than what ends the map at the
-    other side: it may be the ceiling of a map whose floor was removed.
+    other side: it may be the ceiling of a map whose floor was removed, unless it has so many of the points that it
+    is ground outdoors. Furniture alone contradicts any sign.
     """
+    turn = rotation_to_z(up).T
     height = points @ up
-    level = flat.xyz[_level(np.abs(flat.normal @ up), 4 * MODEL.tolerance_deg)] @ up
+    surfaces = flat.xyz[_level(np.abs(flat.normal @ up), 4 * MODEL.tolerance_deg)] @ turn
+    level = surfaces[:, 2]
+    width = _width(surfaces) if len(level) > MODEL.floor_share * len(height) else math.inf
     low, high = np.percentile(height, (2, 98))
     # large layers near the ends of the map are its ground or floor, and ceiling; reflections may lie beyond them
     ends = (low - MODEL.layer_m, high + MODEL.layer_m)
@@ -311,10 +325,13 @@ def _sign(up: F64, flat: _Flat, points: F64, origin: F64) -> tuple[float, bool]:
     floor, ceiling = float(low), float(high)
     evidence = 0.0
     one_end = False
+    is_ground = width > MODEL.ground_width_min_m and count[large].sum() > MODEL.ground_points_min * len(height)
     if len(large):
-        below, above = (float(count[large][side].sum()) for side in (edges[large] < middle, edges[large] >= middle))
+        off = (edges[large] + edges[large + 1]) / 2 - middle
+        quarter = (edges[1] - edges[0]) / 4  # a layer at half the height is neither below nor above
+        below, above = (float(count[large][side].sum()) for side in (off < -quarter, off > quarter))
         one_end = min(below, above) < 0.1 * max(below, above)
-        evidence += 0.5 * (below - above) / (below + above)  # a floor is seen better than a ceiling
+        evidence += 0.5 * (below - above) / max(below + above, 1.0)  # a floor is seen better than a ceiling
         floor = float(edges[large[0]]) if below else floor
         ceiling = float(edges[large[-1] + 1]) if above else ceiling
     start, layer = float(origin @ up), floor if evidence > 0 else ceiling
@@ -325,7 +342,29 @@ def _sign(up: F64, flat: _Flat, points: F64, origin: F64) -> tuple[float, bool]:
     doubtful = one_end and evidence * by_start < 0
     if not one_end:  # otherwise what ends the map at the top is not a ceiling
         evidence += by_start
-    elif doubtful and abs(layer - start) > MODEL.sensor_height_max_m:
+    elif doubtful and abs(layer - start) > MODEL.sensor_height_max_m and not is_ground:
         evidence = 0.0
     z = up[2] if abs(up[2]) > 0.7 else 0.5 * up[1]
+    doubtful = doubtful or _is_furniture(width, (points @ turn)[:, :2])
     return float(np.clip(evidence + MODEL.axis_sign_weight * z, -1, 1)), doubtful
+
+
+def _width(level: F64) -> float:
+    """Width of the widest connected surface of level points (N, 3), metres."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    voxels = np.unique(np.floor(level / MODEL.step_m), axis=0)
+    i, j = cKDTree(voxels).query_pairs(1.5, p=np.inf, output_type="ndarray").T
+    count, part = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(len(voxels), len(voxels))))
+    low, high = np.full((2, count, 2), [[[np.inf]], [[-np.inf]]])
+    np.minimum.at(low, part, voxels[:, :2])
+    np.maximum.at(high, part, voxels[:, :2])
+    return float((high - low).max() + 1) * MODEL.step_m[0]
+
+
+def _is_furniture(width: float, xy: F64) -> bool:
+    """Whether the widest level surface is too small for a floor, ceiling or ground of a map with positions (N, 2)."""
+    extent = float(np.ptp(np.percentile(xy, (2, 98), axis=0), axis=0).max())
+    return width < min(MODEL.furniture_max_m, MODEL.furniture_share_max * extent)

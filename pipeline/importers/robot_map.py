@@ -37,7 +37,7 @@ from scan2sim.pipeline.robot_maps.label_colours import (
 )
 from scan2sim.pipeline.robot_maps.outliers import below_floor, far_outliers
 
-VERSION = 5
+VERSION = 6
 """Version of the importer: raised when the same input and options give another tile."""
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 MIN_TILT_DEG = 0.5

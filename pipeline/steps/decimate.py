@@ -15,8 +15,8 @@ from scan2sim.pipeline.geometry.coarse_surface import coarse_faces
 
 COARSE_SHARE_MAX = 0.2
 """Largest number of triangles of coarse surface over that of all others; they come in addition to the target."""
-TRIANGLES_PER_POINT = 3
-"""A closed surface has two triangles per vertex: more of them than this per point of a sparse map add no shape."""
+TRIANGLES_PER_POINT = 6
+"""More than this per point of a sparse map add no shape, fewer lose some (docs/benchmarks/robot-maps.md)."""
 
 
 class DecimateContext(Context):
@@ -115,7 +115,7 @@ def can_decimate(params: DecimateParams) -> None:
 
 DECIMATE = Step(
     "decimate",
-    4,
+    5,
     decimate,
     DecimateParams,
     class_defaults={"vegetation": {"target": 300_000}, "vehicle": {"target": 50_000}},

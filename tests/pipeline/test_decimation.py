@@ -93,10 +93,10 @@ def test_unknown_backend_lists_available_ones() -> None:
         DECIMATE.check(DecimateParams(backend="pyfqmr"))
 
 
-def test_surface_of_a_sparse_map_gets_three_triangles_per_point(tmp_path: Path) -> None:
+def test_surface_of_a_sparse_map_gets_six_triangles_per_point(tmp_path: Path) -> None:
     whole, rng = hills(), np.random.default_rng(0)
     whole.save(tmp_path / "mesh.npz")
-    xy = rng.uniform(0.5, 11, (3000, 2))
+    xy = rng.uniform(0.5, 11, (2000, 2))
     xyz = np.column_stack([xy, 0.5 * np.sin(xy[:, 0]) * np.cos(xy[:, 1])]).astype(np.float32)
     PointCloud(Frame(), xyz).save(tmp_path / "cloud.npz")
     inputs = {"mesh": tmp_path / "mesh.npz", "cloud": tmp_path / "cloud.npz"}
@@ -106,4 +106,4 @@ def test_surface_of_a_sparse_map_gets_three_triangles_per_point(tmp_path: Path) 
         done = DECIMATE.run(inputs, step_params(DecimateParams, by_points=by_points), out, silent)
         sizes[by_points] = len(small := Mesh.load(done.files["mesh"]))
         assert height_error(small) < 0.02
-    assert sizes[False] == len(whole) and sizes[True] == pytest.approx(9000, rel=0.05)
+    assert sizes[False] == len(whole) and sizes[True] == pytest.approx(12_000, rel=0.05)

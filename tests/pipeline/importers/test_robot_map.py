@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from scan2sim.data_samples.building import Style, Surface, build
+from scan2sim.flows.commands.inspect_map import map_facts
 from scan2sim.pipeline.core.types import F32, F64, Frame, PointCloud
+from scan2sim.pipeline.geometry.surface_distance import sample_surface
 from scan2sim.pipeline.geometry.upright import find_up, rotation_to_z
 from scan2sim.pipeline.importers.robot_map import MapParams, import_map, map_files
 from scan2sim.pipeline.io import clouds
@@ -71,6 +74,39 @@ def test_map_with_a_ceiling_whose_floor_was_removed_stays_upright(tmp_path: Path
     up = T[:3, :3] @ turn.as_matrix()[:, 2]
     assert np.degrees(np.arccos(up[2])) < 0.5
     assert any("ambiguous" in warning and "--up" in warning for warning in warnings)
+
+
+def office(*surfaces: Surface, seed: int) -> F32:
+    """Points on surfaces of an office in the axes of a sensor that starts level in it."""
+    building = build(seed, Style(rooms=3))
+    points = sample_surface(building.only(*surfaces), 40_000, seed)
+    noise = np.random.default_rng(seed).normal(0, 0.02, points.shape)
+    return (points + noise - building.routes[0][0] - [0, 0, SENSOR_HEIGHT_M]).astype(np.float32)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_furniture_without_a_floor_is_ambiguous(tmp_path: Path, seed: int) -> None:
+    """Table tops would be a floor if furniture was on its head."""
+    turn = Rotation.random(random_state=seed)
+    floor = (Surface.FLOOR, Surface.CEILING)
+    whole = present(find_up(turn.apply(office(Surface.FURNITURE, *floor, seed=seed)).astype(np.float32)))
+    assert np.degrees(np.arccos(whole.up @ turn.as_matrix()[:, 2])) < 0.5 and not whole.ambiguous
+    furniture = turn.apply(office(Surface.FURNITURE, seed=seed)).astype(np.float32)
+    _, _, warnings = imported(save(tmp_path / "map.las", furniture), tmp_path / "tile")
+    assert any("ambiguous" in warning and "--up" in warning for warning in warnings)
+    assert "ambiguous" in dict(map_facts(PointCloud(Frame(), furniture)))["up axis"]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ground_far_below_the_sensor_is_no_ceiling(seed: int) -> None:
+    """A lorry's sensor is further from the road than from the top of what stands beside it."""
+    rng = np.random.default_rng(seed)
+    road = rng.uniform((-40, -8, -2.4), (40, 8, -2.4), (20_000, 3))
+    walls = [rng.uniform((-40, y, -2.4), (40, y, 0.8), (6_000, 3)) for y in (-8.0, 8.0)]
+    xyz = np.concatenate([road, *walls]) + rng.normal(0, 0.02, (32_000, 3))
+    turn = Rotation.random(random_state=seed)
+    found = present(find_up(turn.apply(xyz).astype(np.float32)))
+    assert np.degrees(np.arccos(found.up @ turn.as_matrix()[:, 2])) < 0.5
 
 
 def test_tilted_map_becomes_level_and_its_transform_maps_it_to_the_world(tmp_path: Path) -> None:
