@@ -143,6 +143,7 @@ def _blended(photos: Sequence[Photo], kept: Sequence[F32], shown: Sequence[U8], 
     for k in nearest[:MAX_BLENDED]:
         other, texture = photos[k], shown[k]
         uv, inside = pixels(other.camera, other.view.T_world_cam, points)
+        uv = np.where(inside[:, None], uv, 0)  # NaN behind the camera
         c, r = np.clip(np.rint(uv).astype(int), 0, np.array(other.sky.shape[::-1]) - 1).T
         expected = 1 / np.maximum(np.linalg.norm(points - other.view.centre, axis=1), 0.1)
         found = other.inverse[r, c]

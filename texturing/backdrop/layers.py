@@ -203,6 +203,7 @@ def _votes(photos: Sequence[Photo], index: int, inverse: F32, wanted: Bools) -> 
     nearest = [int(k) for k in np.argsort(distance, kind="stable") if k != index]
     for other in (photos[k] for k in nearest[:MAX_COMPARED]):
         uv, inside = pixels(other.camera, other.view.T_world_cam, points)
+        uv = np.where(inside[:, None], uv, 0)  # NaN behind the camera
         column, row = np.clip(np.rint(uv).astype(int), 0, np.array(other.sky.shape[::-1]) - 1).T
         expected = 1 / np.maximum(np.linalg.norm(points - other.view.centre, axis=1), 0.1)
         found = other.inverse[row, column]
