@@ -511,3 +511,29 @@ def test_versions_without_package_metadata(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(importlib.metadata, "requires", none)
     assert versions.__wrapped__() == {"python": sys.version.split()[0], "scan2sim": scan2sim.__version__}
+
+
+def test_a_script_without_a_guard_of_its_main_part_runs_once(source: Path, tmp_path: Path) -> None:
+    """As `scan2sim.run` is used: processes of steps must not run the script again."""
+    script = tmp_path / "my_script.py"
+    script.write_text(
+        f"""
+from pathlib import Path
+from scan2sim.flows.engine.execution import execute
+from scan2sim.flows.engine.planning import plan
+from scan2sim.pipeline.core.cache import Store
+from tests.flows.toy import chain
+
+folder, store = Path({str(tmp_path)!r}), Store(Path({str(tmp_path)!r}) / "store")
+print("runs", flush=True)
+outcome = execute(plan(chain(Path({str(source)!r}), folder / "log"), store), store, jobs=2, on_event=lambda *_: None)
+outcome.check()
+print("total", outcome.of_tile()["d"].metrics["total"])
+""",
+        encoding="utf-8",
+    )
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["runs", "total", "2"]
