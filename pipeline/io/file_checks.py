@@ -123,6 +123,16 @@ def make_folder(folder: Path) -> None:
         raise from_os_error(error, folder) from error
 
 
+def symlink_or_copy(source: Path, target: Path) -> None:
+    """Make `target` a symbolic link to `source`, or a copy where there are none (exFAT, many network drives)."""
+    try:
+        target.symlink_to(source.resolve())
+    except FileExistsError:
+        raise
+    except OSError:
+        shutil.copyfile(source, target)
+
+
 def link_or_copy(source: Path, target: Path) -> None:
     """Make `target` a hard link to `source` (neither may be changed afterwards), or a copy where links fail."""
     try:

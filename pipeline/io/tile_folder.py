@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
@@ -55,7 +55,8 @@ def tile_folder(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Iter
     except OSError as error:
         raise from_os_error(error, out) from error
     try:
-        work.chmod(0o755)  # mkdtemp makes it accessible to the user only
+        with suppress(PermissionError):  # of a file system without permissions
+            work.chmod(0o755)  # mkdtemp makes it accessible to the user only
         yield work
         if out.exists():
             old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
@@ -82,7 +83,7 @@ def add_file(source: Path, folder: Path, name: str, link: bool = False) -> str:
         raise InputError(source, f"is the second file with the name {name} in the tile", "Rename one of them")
     target.parent.mkdir(parents=True, exist_ok=True)
     if link:
-        target.symlink_to(source.resolve())
+        file_checks.symlink_or_copy(source, target)
     else:
         shutil.copyfile(source, target)
     return name

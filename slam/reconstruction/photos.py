@@ -209,7 +209,7 @@ def stage(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, str]
         target = folder / f"{i:06d}{source.suffix.lower() if readable else '.png'}"
         target.unlink(missing_ok=True)
         if readable:
-            target.symlink_to(source.resolve())
+            file_checks.symlink_or_copy(source, target)
         else:
             image.write(target, image.read_rgb(source))
         staged[photo.name] = target.name
