@@ -6,7 +6,7 @@ RUN apt-get update \
     && xargs -a /tmp/packages.txt apt-get install -y --no-install-recommends \
     && rm -rf /var/lib/apt/lists/* \
     && useradd --create-home --uid 1000 scan2sim \
-    && install -d -o scan2sim -g scan2sim /data
+    && install -d -o scan2sim -g scan2sim /data /home/scan2sim/.cache
 ENV PATH=/opt/venv/bin:$PATH PYTHONUNBUFFERED=1 DO_NOT_TRACK=1
 WORKDIR /app
 

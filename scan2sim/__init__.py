@@ -7,6 +7,8 @@ name, `scan2sim.<package>`, in a checkout and installed, whatever else is called
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from scan2sim.pipeline.core import kernel_cache
+
 if TYPE_CHECKING:
     from scan2sim.flows.api import (
         ScanError,
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
         survey,
     )
 
+kernel_cache.choose()  # before numba is imported
 __version__ = "0.1.0"
 __all__ = [
     "ScanError",

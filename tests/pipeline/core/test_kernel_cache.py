@@ -1,0 +1,86 @@
+"""Compiled kernels have a folder for users who can write neither the installation nor their home."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from scan2sim.pipeline.core import kernel_cache
+from tests.conftest import ROOT
+
+
+@pytest.fixture
+def read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder below which nothing can be written; the temporary folder is beside it."""
+    access = os.access
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(os, "access", lambda path, mode: "read only" not in str(path) and access(path, mode))
+    (tmp_path / "read only").mkdir()
+    return tmp_path / "read only"
+
+
+def test_numbas_own_choices_come_first(read_only: Path, tmp_path: Path) -> None:
+    for environment, code in (
+        ({"HOME": str(read_only)}, tmp_path),
+        ({"HOME": str(tmp_path)}, read_only),
+        ({"HOME": str(read_only), "XDG_CACHE_HOME": str(tmp_path)}, read_only),
+        ({"HOME": str(read_only), kernel_cache.VARIABLE: "chosen"}, read_only),
+    ):
+        before = dict(environment)
+        kernel_cache.choose(environment, code)
+        assert environment == before
+
+
+@pytest.mark.parametrize("home", ["/dev/null", "/"])
+def test_a_folder_of_ones_own_is_the_last_choice(
+    home: str, read_only: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: str(path) != "/" and access(path, mode))
+    environment = {"HOME": home}
+    kernel_cache.choose(environment, read_only)
+    folder = Path(environment[kernel_cache.VARIABLE])
+    assert folder.parent == tmp_path and folder.stat().st_mode & 0o777 == 0o700
+    again = {"HOME": home}
+    kernel_cache.choose(again, read_only)
+    assert again == environment, "kernels are compiled once"
+
+
+def test_folders_that_others_can_write_arent_used(read_only: Path, tmp_path: Path) -> None:
+    """Whoever can write compiled kernels can run code as their user."""
+    place = tmp_path / f"scan2sim-kernels-{os.getuid()}"
+    place.symlink_to(read_only)
+    environment = {"HOME": str(read_only)}
+    kernel_cache.choose(environment, read_only)
+    assert environment[kernel_cache.VARIABLE] != str(place)
+    place.unlink()
+    place.mkdir()
+    place.chmod(0o777)
+    environment = {"HOME": str(read_only)}
+    kernel_cache.choose(environment, read_only)
+    assert environment[kernel_cache.VARIABLE] != str(place)
+
+
+def test_a_kernel_runs_where_numba_can_write_nowhere(tmp_path: Path) -> None:
+    program = """
+import numba.core.caching as caching, os, sys
+assert "scan2sim" not in sys.modules
+def refuse(self):
+    raise PermissionError(13, "read-only")
+caching.InTreeCacheLocator.ensure_cache_path = refuse
+access = os.access
+os.access = lambda path, mode: "__pycache__" not in str(path) and access(path, mode)
+import scan2sim
+caching.config.reload_config()
+from scan2sim.texturing.splats import descent
+print(os.environ["NUMBA_CACHE_DIR"])
+"""
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "HOME": "/dev/null", "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert Path(done.stdout.strip()).parent == tmp_path
