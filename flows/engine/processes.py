@@ -15,6 +15,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
+from scan2sim.flows.engine.main_module import STEP
 from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.engine.ready_queue import EventCallback
 from scan2sim.flows.engine.run_task import run_task
@@ -51,7 +52,7 @@ def start(item: PlannedTask, store: Store) -> tuple[Connection, ForkServerProces
     multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
     context = _fork_server()
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(theirs, item, store, item.inputs(store)))
+    process = context.Process(name=STEP, target=_child, args=(theirs, item, store, item.inputs(store)))
     process.start()
     theirs.close()
     return ours, process
