@@ -6,15 +6,20 @@ import ctypes
 import importlib
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
 import tempfile
+import traceback
 from pathlib import Path
 from typing import Any
 
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.pipeline.core.open3d_import import leave_out_plots
+
+COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+"""Escape sequences for the colours of a terminal."""
 
 
 def call(target: str, *args: Any, timeout: float, threads: int | None = None) -> Any:
@@ -51,7 +56,7 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
                 os.killpg(child.pid, signal.SIGKILL)
                 child.wait()
         if child.returncode != 0:
-            lines = stderr.decode(errors="replace").strip().splitlines()
+            lines = [line for line in COLOURS.sub("", stderr.decode(errors="replace")).splitlines() if line.strip()]
             cause = lines[-1] if lines and child.returncode > 0 else f"crashed (exit status {child.returncode})"
             raise StepError(target, cause, "Try another seed, backend or resolution")
         return pickle.loads((exchange / "out").read_bytes())
@@ -74,4 +79,12 @@ def _main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    _main(Path(sys.argv[1]))
+    status = 1
+    try:
+        _main(Path(sys.argv[1]))
+        status = 0
+    except Exception:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(status)  # without freeing anything: native libraries can hang or crash there, too

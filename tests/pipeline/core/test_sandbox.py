@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 
 import psutil
@@ -27,6 +28,16 @@ def refuse() -> None:
     raise ValueError("no such luck")
 
 
+def refuse_in_colour() -> None:
+    raise RuntimeError("\x1b[1;31m[Open3D Error] no charts\n\x1b[0;m")
+
+
+def return_beside_a_thread() -> int:
+    """As of a native library that waits for its threads when it is freed."""
+    threading.Thread(target=time.sleep, args=(600,)).start()
+    return 42
+
+
 def hang() -> None:
     time.sleep(600)
 
@@ -43,6 +54,16 @@ def test_crash_is_reported_as_an_error() -> None:
 def test_exception_of_the_child_is_reported() -> None:
     with pytest.raises(StepError, match="no such luck"):
         sandbox.call(f"{HERE}:refuse", timeout=60)
+
+
+def test_last_line_of_a_coloured_error_is_reported() -> None:
+    with pytest.raises(StepError, match=r"\[Open3D Error\] no charts") as raised:
+        sandbox.call(f"{HERE}:refuse_in_colour", timeout=60)
+    assert "\x1b" not in raised.value.cause
+
+
+def test_threads_that_never_end_dont_hold_the_result() -> None:
+    assert sandbox.call(f"{HERE}:return_beside_a_thread", timeout=60) == 42
 
 
 def test_hanging_child_is_stopped_at_the_timeout() -> None:
