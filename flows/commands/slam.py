@@ -23,6 +23,7 @@ from scan2sim.flows.pipelines.video import ODOMETRY_GROUP, STEPS, Video, build_g
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
 from scan2sim.pipeline.core.errors import LowConfidenceError, SettingError
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.worlds.merge import link
 from scan2sim.slam.trajectory.evaluate import AlignmentKind, Evaluation, evaluate, plot, read_truth
 
@@ -122,7 +123,7 @@ def publish_path(planned: Iterable[PlannedTask], done: Mapping[str, Manifest], s
         place, source = out / name, sources.get(name)
         shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
         if source is not None:
-            shutil.copytree(source, place, copy_function=link) if source.is_dir() else link(str(source), str(place))
+            copy_tree(source, place, link) if source.is_dir() else link(str(source), str(place))
     (out / "slam.json").write_text(json.dumps(_figures(done), indent=1) + "\n", encoding="utf-8")
 
 

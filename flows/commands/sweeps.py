@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.planning import STORE
 from scan2sim.flows.pipelines.graph import Output, Task
 from scan2sim.pipeline.core.cache import Digests, Store
+from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.worlds.merge import link
 
 
@@ -53,7 +53,7 @@ def run_cached(tasks: Sequence[Task], wanted: Mapping[str, Path | Output], out: 
             old.unlink()
         for item in planned:
             if "path" in done[item.task.full_name].files:
-                shutil.copytree(folders[item.task.id] / "path", out, copy_function=link, dirs_exist_ok=True)
+                copy_tree(folders[item.task.id] / "path", out, link)
         store.sweep({item.task.id.name: item.key for item in planned})
         digests.save()
     for manifest in done.values():

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from scan2sim.pipeline.core.errors import InputError, from_os_error
@@ -121,6 +123,27 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise from_os_error(error, folder) from error
+
+
+def copy_tree(source: Path, target: Path, copy: Callable[[str, str], object] = shutil.copyfile) -> None:
+    """Copy all files below a folder by `copy(source, target)`, into folders that may exist.
+
+    Contents only: many network drives refuse the permissions and times that `shutil.copytree` copies, too.
+    """
+    target.mkdir(parents=True, exist_ok=True)
+    for entry in sorted(source.iterdir()):
+        if entry.is_dir():
+            copy_tree(entry, target / entry.name, copy)
+        else:
+            copy(str(entry), str(target / entry.name))
+
+
+def copy_with_time(source: Path, target: Path) -> None:
+    """Copy a file with its modification time, if the disk accepts it."""
+    shutil.copyfile(source, target)
+    stat = source.stat()
+    with suppress(PermissionError):
+        os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
 def symlink_or_copy(source: Path, target: Path) -> None:

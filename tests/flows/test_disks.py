@@ -14,6 +14,8 @@ import pytest
 from scan2sim.flows.commands.drive import _link
 from scan2sim.flows.engine.lock import locked
 from scan2sim.pipeline.core.errors import BusyError, UnavailableError
+from scan2sim.pipeline.io.file_checks import copy_tree
+from scan2sim.pipeline.io.worlds.merge import link
 from tests.flows.inline_steps import inline_steps
 from tests.flows.tiny import COARSE, tiny
 from tests.flows.tiny import scan2sim as run_scan2sim
@@ -29,13 +31,18 @@ def refuse(code: int) -> Callable[..., Any]:
 
 
 @pytest.fixture
+def tile(small_street: Path, tmp_path: Path) -> Path:
+    return tiny(small_street, tmp_path / "tile", photo_scale=0.5, truth=False)
+
+
+@pytest.fixture
 def exfat(monkeypatch: pytest.MonkeyPatch) -> None:
     for owner, name in ((os, "link"), (os, "symlink"), (os, "chmod")):
         monkeypatch.setattr(owner, name, refuse(errno.EPERM))
 
 
-def test_a_world_is_built_on_a_disk_without_links(small_street: Path, tmp_path: Path, exfat: None) -> None:
-    tile, out = tiny(small_street, tmp_path / "tile", photo_scale=0.5, truth=False), tmp_path / "out"
+def test_a_world_is_built_on_a_disk_without_links(tile: Path, tmp_path: Path, exfat: None) -> None:
+    out = tmp_path / "out"
     for reused in (False, True):
         with inline_steps():
             code, text = run_scan2sim("run", tile, "--out", out, settings=COARSE)
@@ -44,6 +51,17 @@ def test_a_world_is_built_on_a_disk_without_links(small_street: Path, tmp_path: 
     assert (out / "world" / "street.sdf").is_file()
     photos = list((out / "steps" / "views").glob("*/views/photos/*"))
     assert photos and not any(photo.is_symlink() for photo in photos)
+
+
+def test_folders_are_copied_to_a_disk_that_refuses_times(
+    tmp_path: Path, exfat: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "utime", refuse(errno.EPERM))
+    (tmp_path / "made" / "meshes").mkdir(parents=True)
+    (tmp_path / "made" / "meshes" / "ground.glb").write_bytes(b"mesh")
+    for _ in range(2):  # the second time into the folder of the first one
+        copy_tree(tmp_path / "made", tmp_path / "world", link)
+    assert (tmp_path / "world" / "meshes" / "ground.glb").read_bytes() == b"mesh"
 
 
 def test_results_of_a_drive_are_named_where_they_cant_be_linked(tmp_path: Path, exfat: None) -> None:
