@@ -6,7 +6,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import tempfile
 import threading
 import traceback
 from multiprocessing import forkserver, resource_tracker
@@ -19,6 +18,7 @@ from scan2sim.flows.engine.main_module import STEP
 from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.engine.ready_queue import EventCallback
 from scan2sim.flows.engine.run_task import run_task
+from scan2sim.pipeline.core.anonymous_file import anonymous_file
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import ScanError, StepError
 
@@ -66,7 +66,7 @@ def _child(connection: Connection, item: PlannedTask, store: Store, inputs: dict
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and stops its children
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     os.setpgrp()
-    output = tempfile.TemporaryFile() if sys.platform != "linux" else os.fdopen(os.memfd_create("said"), "w+b")
+    output = anonymous_file()
     for stream in (1, 2):
         os.dup2(output.fileno(), stream)
     threading.Thread(target=_exit_with_parent, daemon=True).start()

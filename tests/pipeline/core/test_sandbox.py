@@ -20,6 +20,10 @@ def double(value: int) -> int:
     return 2 * value
 
 
+def same(values: list[int]) -> list[int]:
+    return values
+
+
 def crash() -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
@@ -44,6 +48,13 @@ def hang() -> None:
 
 def test_result_of_the_child_is_returned() -> None:
     assert sandbox.call(f"{HERE}:double", 21, timeout=60) == 42
+
+
+def test_a_child_runs_where_there_is_no_folder_for_temporary_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", "/nowhere")
+    monkeypatch.setattr("tempfile.tempdir", "/nowhere")
+    values = list(range(300_000))
+    assert sandbox.call(f"{HERE}:same", values, timeout=60) == values
 
 
 def test_crash_is_reported_as_an_error() -> None:
