@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import os
+import shutil
 import signal
 import sys
+import tempfile
 import threading
 import traceback
 from multiprocessing import forkserver, resource_tracker
@@ -24,6 +27,8 @@ from scan2sim.pipeline.core.errors import ScanError, StepError
 
 TRACKER_WARNING_FILTER = "ignore:resource_tracker"
 """Silences the warnings of Python's resource tracker, which cleans up after killed processes."""
+SOCKETS = "/tmp"
+"""Folder where sockets can be created if TMPDIR has too long a path for them (108 bytes), or a disk without sockets."""
 MAX_OUTPUT_BYTES = 10_000
 """Size limit of the output of a failed step's libraries in the log; its end is kept."""
 
@@ -40,10 +45,21 @@ def _fork_server() -> Any:
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        forkserver.ensure_running()
+        try:
+            forkserver.ensure_running()
+        except OSError:
+            _use_folder_for_sockets(SOCKETS)
+            forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return context
+
+
+def _use_folder_for_sockets(parent: str) -> None:
+    """Let multiprocessing create its sockets in a new folder below `parent`, not in the folder for temporary files."""
+    folder = tempfile.mkdtemp(prefix="pymp-", dir=parent)
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    multiprocessing.current_process()._config["tempdir"] = folder  # type: ignore[attr-defined]
 
 
 def start(item: PlannedTask, store: Store) -> tuple[Connection, ForkServerProcess]:

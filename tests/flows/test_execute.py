@@ -513,10 +513,11 @@ def test_versions_without_package_metadata(monkeypatch: pytest.MonkeyPatch) -> N
     assert versions.__wrapped__() == {"python": sys.version.split()[0], "scan2sim": scan2sim.__version__}
 
 
-def test_a_script_without_a_guard_of_its_main_part_runs_once(source: Path, tmp_path: Path) -> None:
-    """As `scan2sim.run` is used: processes of steps must not run the script again."""
-    script = tmp_path / "my_script.py"
-    script.write_text(
+@pytest.fixture
+def script(source: Path, tmp_path: Path) -> Path:
+    """A user's program that runs the toy graph."""
+    path = tmp_path / "my_script.py"
+    path.write_text(
         f"""
 from pathlib import Path
 from scan2sim.flows.engine.execution import execute
@@ -532,8 +533,24 @@ print("total", outcome.of_tile()["d"].metrics["total"])
 """,
         encoding="utf-8",
     )
-    done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
-    )
+    return path
+
+
+def printed_by(script: Path, **environment: str) -> list[str]:
+    """Words that a script prints."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["runs", "total", "2"]
+    return done.stdout.split()
+
+
+def test_a_script_without_a_guard_of_its_main_part_runs_once(script: Path) -> None:
+    """As `scan2sim.run` is used: processes of steps must not run the script again."""
+    assert printed_by(script) == ["runs", "total", "2"]
+
+
+def test_steps_run_where_the_path_of_the_temporary_folder_is_too_long_for_sockets(script: Path, tmp_path: Path) -> None:
+    folder = tmp_path / ("job" * 30)
+    folder.mkdir()
+    assert printed_by(script, TMPDIR=str(folder)) == ["runs", "total", "2"]
+    assert not list(folder.iterdir())
