@@ -17,6 +17,8 @@ MARKER_FILE = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.
 """File by which a folder of each kind is recognized."""
 
 
+MAX_PREFIX = 50
+"""Maximum length of the temporary folder's prefix in characters: names of files have at most 255 bytes."""
 Kind = Literal["tile", "survey", "world", "page", "set of variations"]
 
 
@@ -38,20 +40,23 @@ def check_target(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Non
 def tile_folder(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Iterator[Path]:
     """Temporary folder beside `out`: renamed to `out` when the block succeeds, deleted when it raises.
 
+    A mounted disk and the current folder can't be replaced, so their content is.
+
     Args:
         out: the folder to create.
         overwrite: replace an existing folder of the same kind.
         kind: kind of content; only folders with its marker file are overwritten.
 
     Raises:
-        SettingError: as `check_target`.
+        SettingError: as `check_target`; or the new folder has links to files of the one that it would replace.
         SpaceError: the disk is full or not writable.
     """
-    out = Path.cwd() / out
+    out = Path(out).resolve()
     check_target(out, overwrite, kind)
+    stays = out.is_dir() and (out.is_mount() or out.samefile("."))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+        work = Path(tempfile.mkdtemp(prefix=f".{out.name}-"[:MAX_PREFIX], dir=out if stays else out.parent))
     except OSError as error:
         raise from_os_error(error, out) from error
     try:
@@ -59,9 +64,14 @@ def tile_folder(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Iter
             work.chmod(0o755)  # mkdtemp makes it accessible to the user only
         yield work
         if out.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
-            out.replace(old)
-            work.replace(out)
+            _check_links(work, out)
+            old = Path(tempfile.mkdtemp(prefix=".old-", dir=work.parent))
+            if stays:
+                _move_content(out, old, [old, work])
+                _move_content(work, out)
+            else:
+                out.replace(old)
+                work.replace(out)
             shutil.rmtree(old)
         else:
             work.replace(out)
@@ -69,6 +79,21 @@ def tile_folder(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Iter
         raise from_os_error(error, out) from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
+
+
+def _check_links(work: Path, out: Path) -> None:
+    """Check that a new folder has no links to files of the folder that it replaces, which would be lost."""
+    for link in (path for path in work.rglob("*") if path.is_symlink()):
+        source = link.resolve()
+        if source.is_relative_to(out) and not source.is_relative_to(work):
+            remedy = "Leave out --link, or choose another --out"
+            raise SettingError(out, f"contains {source}, which would be lost", remedy)
+
+
+def _move_content(folder: Path, target: Path, without: Sequence[Path] = ()) -> None:
+    for path in list(folder.iterdir()):
+        if path not in without:
+            path.replace(target / path.name)
 
 
 def add_file(source: Path, folder: Path, name: str, link: bool = False) -> str:
