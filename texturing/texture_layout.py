@@ -8,7 +8,6 @@ unwrapped by the other.
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -16,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.core.cores import available_cores
 from scan2sim.pipeline.core.errors import SettingError, StepError
 from scan2sim.pipeline.core.parameters import Seconds, Texel
 from scan2sim.pipeline.core.step import Params, Report
@@ -197,7 +197,7 @@ def _unwrap_all(mesh: Mesh, blocks: list[Index], params: UnwrapParams) -> list[U
     by_size = sorted(range(len(blocks)), key=lambda i: -len(blocks[i]))
     results: dict[int, Unwrapped] = {}
     failed: dict[int, str] = {}
-    with ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, len(blocks)))) as pool:
+    with ThreadPoolExecutor(max(1, min(available_cores(), len(blocks)))) as pool:
         for i, flat in zip(by_size, pool.map(lambda i: _in_child(mesh, blocks[i], own, params), by_size), strict=True):
             if isinstance(flat, str):
                 failed[i] = flat

@@ -6,6 +6,7 @@ Steps and Numba's type tables are included: the demo's 59 processes take 52 s wi
 
 from importlib import import_module
 
+import scan2sim.flows.engine.thread_limit  # isort: skip  # before the libraries
 import cv2  # noqa: F401
 import laspy  # noqa: F401
 import numba.core.boxing  # noqa: F401
