@@ -118,6 +118,26 @@ def test_digests_are_cached_until_a_file_changes(tmp_path: Path, source: Path) -
     assert Digests(file)(source) == digest(source) != known
 
 
+def test_digests_notice_a_file_that_was_overwritten_with_its_old_time(tmp_path: Path, source: Path) -> None:
+    before = source.stat()
+    digests = Digests(tmp_path / "digests.json", clock=lambda: before.st_ctime_ns + 10**10)
+    known = digests(source)
+    digests.save()
+    while source.stat().st_ctime_ns == before.st_ctime_ns:  # clocks of disks are coarse
+        source.write_text("2", encoding="utf-8")  # as many bytes
+    os.utime(source, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert Digests(tmp_path / "digests.json")(source) == digest(source) != known
+
+
+def test_digests_of_files_that_may_still_be_written_are_not_kept(tmp_path: Path, source: Path) -> None:
+    written = source.stat().st_ctime_ns
+    for age, kept in ((10**9, 0), (10**10, 1)):
+        digests = Digests(tmp_path / "digests.json", clock=lambda age=age: written + age)
+        assert digests(source) == digest(source)
+        digests.save()
+        assert len(json.loads((tmp_path / "digests.json").read_text(encoding="utf-8"))) == kept
+
+
 def test_keep_going_runs_all_independent_tasks(tmp_path: Path, source: Path, ran: Callable[[], str]) -> None:
     store = Store(tmp_path / "store")
     tasks = chain(source, tmp_path / "log", b={"does": "fail"})
