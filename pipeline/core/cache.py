@@ -160,7 +160,7 @@ def content_of(digests: Mapping[str, str]) -> str:
     """Digest of all files of a result, computed from their names and digests."""
     combined = hashlib.sha256()
     for name in sorted(digests):
-        combined.update(f"{name}\0{digests[name]}\n".encode())
+        combined.update(f"{name}\0{digests[name]}\n".encode(errors="surrogateescape"))  # names may not be UTF-8
     return combined.hexdigest()
 
 

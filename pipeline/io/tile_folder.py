@@ -100,9 +100,13 @@ def add_file(source: Path, folder: Path, name: str, link: bool = False) -> str:
     """Copy (or symlink, by absolute path) `source` to `folder/name`; returns `name`.
 
     Raises:
-        InputError: the source is missing, or the name is already used by another file.
+        InputError: the source is missing, the name is already used by another file, or can't be written in a tile.toml.
     """
     target = folder / name
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise InputError(source, "has a name that isn't UTF-8", "Rename it (`convmv` renames many files)") from None
     file_checks.check(source, "Check the path, or remove the entry that names it")
     if target.exists() or target.is_symlink():
         raise InputError(source, f"is the second file with the name {name} in the tile", "Rename one of them")

@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 import scan2sim
+from scan2sim.flows.commands.log import Log
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import execute, run_to_world
 from scan2sim.flows.engine.lock import locked
@@ -274,6 +275,15 @@ def test_digest_of_a_folder_covers_names_and_contents(tmp_path: Path) -> None:
     assert digests(folder) == before != digest(tmp_path / "absent")
     (folder / "1.png").rename(folder / "2.png")
     assert digests(folder) == digest(folder) != before
+
+
+def test_file_names_of_another_encoding_have_digests_and_are_logged(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode("straße".encode("latin-1"))
+    folder.mkdir()
+    (folder / folder.name).write_bytes(b"photo")
+    assert digest(folder) != digest(tmp_path) and digest(folder) == Digests(tmp_path / "digests.json")(folder)
+    Log(tmp_path / "run.log").write(f"tile {folder}")
+    assert "stra\\udcdfe" in (tmp_path / "run.log").read_text(encoding="utf-8")
 
 
 def test_deleted_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:

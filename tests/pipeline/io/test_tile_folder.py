@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 
 import pytest
 
-from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.io.tile_folder import MARKER_FILE, add_file, tile_folder
 
 
@@ -58,6 +59,13 @@ def test_files_that_the_new_tile_links_to_are_not_deleted(tmp_path: Path) -> Non
     with pytest.raises(SettingError, match="would be lost"), tile_folder(tile, overwrite=True) as folder:
         add_file(tile / "cloud.laz", folder, "cloud.laz", link=True)
     assert (tile / "cloud.laz").read_bytes() == b"points" and names(tmp_path) == ["tile"]
+
+
+def test_file_names_of_another_encoding_are_reported(tmp_path: Path) -> None:
+    photo = tmp_path / os.fsdecode("straße.jpg".encode("latin-1"))
+    photo.write_bytes(b"photo")
+    with pytest.raises(InputError, match=r"stra\\udcdfe.jpg: has a name that isn't UTF-8"):
+        add_file(photo, tmp_path / "tile", f"photos/{photo.name}")
 
 
 def test_folders_with_long_names_can_be_created(tmp_path: Path) -> None:
