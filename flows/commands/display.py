@@ -7,7 +7,6 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
@@ -102,8 +101,15 @@ class RunDisplay:
                 console.print(f"{mark} {task.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._task_count}")
 
 
-def log_unexpected(error: BaseException) -> Path:
-    """Write the traceback of an unexpected error to a temporary file; returns its path."""
-    with tempfile.NamedTemporaryFile("w", prefix="scan2sim-error-", suffix=".log", delete=False) as file:
-        file.write("".join(traceback.format_exception(error)))
-    return Path(file.name)
+def log_unexpected(error: BaseException) -> str:
+    """Write the traceback of an unexpected error to a temporary file, or print it; returns where it is."""
+    try:
+        file = tempfile.NamedTemporaryFile(
+            "w", prefix="scan2sim-error-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        )
+        with file:
+            file.write("".join(traceback.format_exception(error)))
+    except OSError:  # no folder for temporary files, or no space in it
+        traceback.print_exception(error)
+        return "the traceback above"
+    return file.name
