@@ -26,9 +26,9 @@ app = App()
 
 
 @contextmanager
-def _simplified(scene: Scene, limits: Budget, levels: int, report: Report) -> Iterator[Scene]:
-    """The scene reduced to a budget, with levels of detail; its files are temporary, deleted with the context."""
-    with tempfile.TemporaryDirectory() as work:
+def _simplified(scene: Scene, limits: Budget, levels: int, folder: Path, report: Report) -> Iterator[Scene]:
+    """The scene reduced to a budget, with levels of detail; its files in `folder` are deleted with the context."""
+    with tempfile.TemporaryDirectory(prefix=".simplified-", dir=folder) as work:
         if limits != Budget():
             from scan2sim.texturing.simplify_textured import simplified_scene
 
@@ -92,7 +92,7 @@ def export(
     with (
         progress("export") as report,
         tile_folder(out, overwrite, "world") as folder,
-        _simplified(scene, limits, levels or world_formats.levels(formats), report) as small,
+        _simplified(scene, limits, levels or world_formats.levels(formats), folder, report) as small,
     ):
         world_formats.write(small, formats, folder, params, report, robot)
         _warn_of_exceeded_budget(small, limits)

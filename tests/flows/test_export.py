@@ -36,6 +36,15 @@ def test_export_equals_the_world_of_the_pipeline(tmp_path: Path) -> None:
     assert files(tmp_path / "out") == own
 
 
+def test_simplified_meshes_need_no_space_in_the_temporary_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = synthetic.world(tmp_path).files["world"]
+    monkeypatch.setattr("tempfile.tempdir", "/nowhere")
+    run(world, "--to", "tiles3d", "--out", tmp_path / "out", "--levels", 2)
+    assert not [name for name in files(tmp_path / "out") if name.startswith(".")]
+
+
 def test_foreign_folders_are_never_overwritten(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path).files["world"]
     out = tmp_path / "out"
