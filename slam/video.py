@@ -14,6 +14,7 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8
+from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images.image import SUFFIXES, read_levels
 
 
@@ -139,7 +140,8 @@ def _natural(path: Path) -> list[Any]:
 
 
 def _files(path: Path) -> list[Path]:
-    return sorted((p for p in path.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
+    found = (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and not file_checks.hidden(p))
+    return sorted(found, key=_natural)
 
 
 def _folder(path: Path, fps: float, times: Path | None) -> Video:

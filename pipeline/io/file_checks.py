@@ -88,14 +88,19 @@ def check_data(path: Path) -> Path:
     return path
 
 
+def hidden(path: Path) -> bool:
+    """Whether a file is hidden: macOS writes a `._NAME.SUFFIX` beside each file on exFAT and network drives."""
+    return path.name.startswith(".")
+
+
 def files(folder: Path) -> list[Path]:
-    """Files in a folder, sorted by name.
+    """Files in a folder that aren't hidden, sorted by name.
 
     Raises:
         InputError: it doesn't exist, is no folder, or may not be read.
     """
     try:
-        return sorted(path for path in folder.iterdir() if path.is_file())
+        return sorted(path for path in folder.iterdir() if path.is_file() and not hidden(path))
     except PermissionError:
         raise InputError(folder, NO_PERMISSION, "Change its permissions") from None
     except NotADirectoryError:

@@ -18,6 +18,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError, ScanError
 from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images import image as photos
 from scan2sim.services.credentials import redacted
 from scan2sim.services.supervision import SupervisedThread
@@ -118,7 +119,7 @@ def _holds_images(path: Path) -> bool:
 def _image_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
-    files = sorted(one for one in path.iterdir() if one.is_file())
+    files = file_checks.files(path)
     found = [one for one in files if one.suffix.lower() in photos.SUFFIXES]
     if not found:
         raise InputError(path, f"contains no {', '.join(photos.SUFFIXES)} files", REMEDY)

@@ -191,7 +191,7 @@ def _described(path: Path, reader: Any) -> Bag:
 
 def _files(folder: Path) -> list[Path]:
     """Files of a bag in a folder: those of the suffix that comes first in `SUFFIXES`."""
-    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    found = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in SUFFIXES and not file_checks.hidden(p)]
     return [p for p in found if p.suffix == found[0].suffix]
 
 
