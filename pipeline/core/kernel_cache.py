@@ -22,8 +22,11 @@ def choose(environment: MutableMapping[str, str] = os.environ, code: Path = Path
         environment: read by numba when it is imported, and passed on to child processes.
         code: folder of a kernel's module.
     """
-    if environment.get(VARIABLE) or _can_write(code / "__pycache__") or _can_write(_users(environment) / "numba"):
+    if environment.get(VARIABLE) or _can_write(code / "__pycache__"):
         return
+    with suppress(RuntimeError):  # the user has no home folder
+        if _can_write(_users(environment) / "numba"):
+            return
     with suppress(OSError):  # no temporary folder either: numba says what it needs
         environment[VARIABLE] = str(_own_folder())
 
@@ -35,7 +38,10 @@ def _users(environment: MutableMapping[str, str]) -> Path:
 
 def _can_write(folder: Path) -> bool:
     """Whether files can be created in a folder, which may have to be created first."""
-    place = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    try:
+        place = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    except PermissionError:  # below another user's folder, such as /root
+        return False
     return place.is_dir() and os.access(place, os.W_OK | os.X_OK)
 
 

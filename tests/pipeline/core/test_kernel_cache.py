@@ -51,6 +51,27 @@ def test_a_folder_of_ones_own_is_the_last_choice(
     assert again == environment, "kernels are compiled once"
 
 
+def test_homes_of_others_and_users_without_a_home(
+    read_only: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exists = Path.exists
+
+    def refuse(path: Path) -> bool:
+        if "root" in path.parts[:-1]:
+            raise PermissionError(13, "Permission denied", str(path))
+        return exists(path)
+
+    def unknown(user: int) -> None:
+        raise KeyError(f"getpwuid(): uid not found: {user}")
+
+    monkeypatch.setattr(Path, "exists", refuse)
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+    monkeypatch.delenv("HOME")
+    for environment in ({"HOME": "/root"}, {}):
+        kernel_cache.choose(environment, read_only)
+        assert Path(environment[kernel_cache.VARIABLE]).parent == tmp_path
+
+
 def test_folders_that_others_can_write_arent_used(read_only: Path, tmp_path: Path) -> None:
     """Whoever can write compiled kernels can run code as their user."""
     place = tmp_path / f"scan2sim-kernels-{os.getuid()}"
