@@ -16,6 +16,7 @@ from scan2sim.flows.commands.sweeps import cached_check, run_before_import
 from scan2sim.flows.pipelines import assembled, bag, dataset, images, kitti, sweeps
 from scan2sim.flows.pipelines.graph import Task
 from scan2sim.pipeline.core.classes import parse_mapping
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.importers.mesh_model import import_mesh
 from scan2sim.pipeline.importers.photogrammetry import import_model
@@ -359,6 +360,8 @@ def import_unposed_photos(
 ) -> None:
     """Photos without poses, or a video: poses by COLMAP, scale and position by GPS and a cloud (docs/images.md)."""
     check_target(out, overwrite)
+    if out.resolve().is_relative_to(source.photos.resolve()):
+        raise SettingError("--out", f"is inside the folder of the photos, {source.photos}", "Choose a folder beside it")
     tasks = images.build_graph(source, Path())
     inputs = run_before_import(tasks, out.with_name(f"{out.name}-photos"))
     params, warnings = tasks[-1].params, list[str]()
