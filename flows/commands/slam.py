@@ -16,6 +16,7 @@ from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.run_with_progress import plan_and_run
 from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.output_folder import check_own
 from scan2sim.flows.engine.planning import STORE, PlannedTask
 from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.pipelines.settings import Settings
@@ -99,6 +100,7 @@ def slam_video(video: Video, out: Path, settings: Settings, bus: PublishedRun | 
         ScanError: see `pipeline.core.errors`; results of earlier runs stay.
     """
     tasks = build_graph(video, settings)
+    check_own(out, (*OUTPUTS, "slam.json"))
     with locked(out):
         store = Store(out / STORE)
         digests = Digests(store.root / "digests.json")

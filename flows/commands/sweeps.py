@@ -9,15 +9,12 @@ from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.run_with_progress import plan_and_run
 from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.output_folder import check_own
 from scan2sim.flows.engine.planning import STORE
 from scan2sim.flows.pipelines.graph import Output, Task
 from scan2sim.pipeline.core.cache import Digests, Store
-from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.worlds.merge import link
-
-OWN_FILES = (".lock", "run.log")
-"""Files that a run writes before its first result."""
 
 
 def run_before_import(tasks: Sequence[Task], out: Path) -> dict[str, Path]:
@@ -43,7 +40,7 @@ def run_cached(tasks: Sequence[Task], wanted: Mapping[str, Path | Output], out: 
     found = {name: source for name, source in wanted.items() if isinstance(source, Path)}
     if not tasks:
         return found
-    _check_own(out)
+    check_own(out)
     with locked(out):
         store = Store(out / STORE)
         digests = Digests(store.root / "digests.json")
@@ -68,17 +65,6 @@ def run_cached(tasks: Sequence[Task], wanted: Mapping[str, Path | Output], out: 
         if summary is not None and "check" not in manifest.files:  # that of a check is printed after the import
             console.print(str(summary), highlight=False, soft_wrap=True, markup=False)
     return found
-
-
-def _check_own(out: Path) -> None:
-    """Check that a folder for cached results has no files of the user, which may be of the same names.
-
-    Raises:
-        SettingError: it has other files.
-    """
-    if out.is_dir() and not (out / STORE).is_dir() and any(path.name not in OWN_FILES for path in out.iterdir()):
-        cause = "is where this import keeps its results, but has other files"
-        raise SettingError(out, cause, "Choose another --out, or rename that folder")
 
 
 def cached_check(task: Task, out: Path) -> Path:

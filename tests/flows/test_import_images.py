@@ -118,7 +118,7 @@ def test_a_tile_inside_the_folder_of_its_photos_is_refused(street: tuple[Path, F
     assert isinstance(error, SettingError) and "inside the folder of the photos" in error.cause
     photos.rename(tmp_path / "street-photos")
     error = command(tmp_path / "street-photos", "--out", tmp_path / "street").exception
-    assert isinstance(error, SettingError) and "has other files" in error.cause
+    assert isinstance(error, SettingError) and "isn't from an earlier run" in error.cause
     assert [path.name for path in tmp_path.iterdir()] == ["street-photos"]
 
 
