@@ -36,7 +36,7 @@ def process_files(engine: Engine, path: Path, out: Path, report: Report, *, draw
     out.mkdir(parents=True, exist_ok=True)
     ended: dict[str, int] = {}
     with ExitStack() as stack:
-        lines = stack.enter_context((out / RESULTS_FILE).open("w"))
+        lines = stack.enter_context((out / RESULTS_FILE).open("w", encoding="utf-8"))
         drawings = stack.enter_context(_DrawnResults(engine.name, out, rate)) if draw else None
         for number, (frame, result) in enumerate(_results(engine, path)):
             _write_line(lines, result)
