@@ -67,7 +67,8 @@ def test_homes_of_others_and_users_without_a_home(
     monkeypatch.setattr(Path, "exists", refuse)
     monkeypatch.setattr("pwd.getpwuid", unknown)
     monkeypatch.delenv("HOME")
-    for environment in ({"HOME": "/root"}, {}):
+    environments: list[dict[str, str]] = [{"HOME": "/root"}, {}]
+    for environment in environments:
         kernel_cache.choose(environment, read_only)
         assert Path(environment[kernel_cache.VARIABLE]).parent == tmp_path
 
