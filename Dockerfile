@@ -13,6 +13,8 @@ WORKDIR /app
 FROM system AS code
 RUN python -m venv /opt/venv
 COPY . .
+# a checkout with umask 077 can be read by its owner only
+RUN chmod -R a+rX .
 
 # without torch, which installs gigabytes of CUDA: reconstruction, videos and surveys don't need it
 FROM code AS cpu-environment
