@@ -21,7 +21,6 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -32,7 +31,7 @@ from typing import Any
 
 from scan2sim.pipeline.core.errors import InputError, from_os_error
 from scan2sim.pipeline.core.parts import Parts
-from scan2sim.pipeline.core.paths import check_inside
+from scan2sim.pipeline.core.paths import check_inside, new_folder
 from scan2sim.pipeline.core.remote import Remote
 from scan2sim.pipeline.core.step import Done, Params, Step
 
@@ -310,7 +309,7 @@ class Store:
         try:
             parent = self.root / task
             parent.mkdir(parents=True, exist_ok=True)
-            return Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent))
+            return new_folder(parent, TEMPORARY_PREFIX)
         except OSError as error:
             raise from_os_error(error, self.root) from None
 

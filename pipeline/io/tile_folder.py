@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
 from scan2sim.pipeline.core.errors import InputError, SettingError, from_os_error
+from scan2sim.pipeline.core.paths import new_folder
 from scan2sim.pipeline.io import file_checks
 
 MARKER_FILE = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.json", "page": "view.js",
@@ -56,16 +56,14 @@ def tile_folder(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Iter
     stays = out.is_dir() and (out.is_mount() or out.samefile("."))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{out.name}-"[:MAX_PREFIX], dir=out if stays else out.parent))
+        work = new_folder(out if stays else out.parent, f".{out.name}-"[:MAX_PREFIX])
     except OSError as error:
         raise from_os_error(error, out) from error
     try:
-        with suppress(PermissionError):  # of a file system without permissions
-            work.chmod(0o755)  # mkdtemp makes it accessible to the user only
         yield work
         if out.exists():
             _check_links(work, out)
-            old = Path(tempfile.mkdtemp(prefix=".old-", dir=work.parent))
+            old = new_folder(work.parent, ".old-")
             if stays:
                 _move_content(out, old, [old, work])
                 _move_content(work, out)

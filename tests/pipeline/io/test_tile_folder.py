@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.io.tile_folder import MARKER_FILE, add_file, tile_folder
 
@@ -59,6 +60,17 @@ def test_files_that_the_new_tile_links_to_are_not_deleted(tmp_path: Path) -> Non
     with pytest.raises(SettingError, match="would be lost"), tile_folder(tile, overwrite=True) as folder:
         add_file(tile / "cloud.laz", folder, "cloud.laz", link=True)
     assert (tile / "cloud.laz").read_bytes() == b"points" and names(tmp_path) == ["tile"]
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o077, 0o700), (0o022, 0o755), (0o002, 0o775)])
+def test_tiles_and_results_have_the_permissions_that_the_user_chose(umask: int, mode: int, tmp_path: Path) -> None:
+    before = os.umask(umask)
+    try:
+        create(tmp_path / "tile")
+        result = Store(tmp_path / "steps").begin("trim")
+    finally:
+        os.umask(before)
+    assert [folder.stat().st_mode & 0o777 for folder in (tmp_path / "tile", result)] == [mode, mode]
 
 
 def test_file_names_of_another_encoding_are_reported(tmp_path: Path) -> None:
