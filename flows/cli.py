@@ -20,7 +20,9 @@ from scan2sim.pipeline.core.errors import (
     IncompleteError,
     ScanError,
     exit_code,
+    from_name_error,
     from_os_error,
+    is_about_a_file_name,
 )
 
 PAGES = Path(__file__).parents[1] / "docs"
@@ -165,6 +167,8 @@ def main() -> None:
     except Exception as error:
         if isinstance(error, OSError):
             error = from_os_error(error, error.filename or "a file")
+        elif isinstance(error, UnicodeEncodeError) and is_about_a_file_name(error):
+            error = from_name_error(error)
 
         if isinstance(error, ScanError):
             level, colour = ("warning", "yellow") if isinstance(error, IncompleteError) else ("error", "red")

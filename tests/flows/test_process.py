@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from scan2sim.flows import cli
 from scan2sim.flows.commands.display import log_unexpected
+from scan2sim.pipeline.core.errors import InputError, from_exception
 from tests.conftest import ROOT
 
 COMMAND = [sys.executable, "-m", "scan2sim.flows.cli"]
@@ -54,6 +56,23 @@ def test_a_deleted_current_folder_is_reported(tmp_path: Path) -> None:
     done = run_in_shell('cd "$0" && rmdir "$0" && "$@"'.replace("$0", str(tmp_path / "gone")), *COMMAND, "sample")
     assert done.returncode == 3 and "the current folder: was deleted" in done.stderr, done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_file_names_of_another_encoding_are_errors_of_the_input(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def write_toml() -> None:
+        f'file = "photos/{os.fsdecode("straße.jpg".encode("latin-1"))}"'.encode()
+
+    with pytest.raises(UnicodeEncodeError) as caught:
+        write_toml()
+    error = from_exception(caught.value, "ingest", Path())
+    assert isinstance(error, InputError) and "photos/stra\\udcdfe.jpg" in error.where
+    monkeypatch.setattr(cli, "app", write_toml)
+    monkeypatch.setattr(sys, "argv", ["scan2sim"])
+    with pytest.raises(SystemExit, match="3"):
+        cli.main()
+    assert "is a file name that isn't UTF-8" in capsys.readouterr().err
 
 
 def test_tracebacks_of_unexpected_errors_are_written_in_any_encoding() -> None:
