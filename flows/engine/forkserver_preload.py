@@ -19,8 +19,10 @@ from numba.core.registry import cpu_target
 
 import scan2sim.flows.engine.main_module
 import scan2sim.flows.pipelines.steps  # noqa: F401
+from scan2sim.pipeline.core.kernel_cache import run_without_space
 from scan2sim.pipeline.core.open3d_import import leave_out_plots
 
+run_without_space()
 leave_out_plots()
 import_module("open3d")
 

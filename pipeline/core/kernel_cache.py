@@ -11,6 +11,7 @@ import stat
 from collections.abc import MutableMapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 VARIABLE = "NUMBA_CACHE_DIR"
 
@@ -29,6 +30,19 @@ def choose(environment: MutableMapping[str, str] = os.environ, code: Path = Path
             return
     with suppress(OSError):  # no temporary folder either: numba says what it needs
         environment[VARIABLE] = str(_own_folder())
+
+
+def run_without_space() -> None:
+    """Let kernels run that numba can't keep, as its folder's disk is full or over quota: they are compiled again."""
+    from numba.core.caching import Cache
+
+    save = Cache.save_overload
+
+    def save_if_possible(self: Any, signature: Any, data: Any) -> None:
+        with suppress(OSError):
+            save(self, signature, data)
+
+    Cache.save_overload = save_if_possible
 
 
 def _users(environment: MutableMapping[str, str]) -> Path:

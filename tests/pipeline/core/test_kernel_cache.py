@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -9,6 +10,8 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from numba import njit
+from numba.core.caching import Cache
 
 from scan2sim.pipeline.core import kernel_cache
 from tests.conftest import ROOT
@@ -86,6 +89,22 @@ def test_folders_that_others_can_write_arent_used(read_only: Path, tmp_path: Pat
     environment = {"HOME": str(read_only)}
     kernel_cache.choose(environment, read_only)
     assert environment[kernel_cache.VARIABLE] != str(place)
+
+
+def test_a_kernel_runs_if_the_disk_of_its_cache_is_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(cache: object, signature: object, data: object) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    @njit(cache=True)
+    def double(value: float) -> float:
+        return 2 * value
+
+    monkeypatch.setattr(Cache, "_save_overload", refuse)
+    with pytest.raises(OSError, match="quota"):
+        double(1)
+    monkeypatch.setattr(Cache, "save_overload", Cache.save_overload)  # restored after the test
+    kernel_cache.run_without_space()
+    assert double(1.5) == 3
 
 
 def test_a_kernel_runs_where_numba_can_write_nowhere(tmp_path: Path) -> None:
