@@ -62,7 +62,9 @@ class Sweeps(PoseSourceParams, SweepsParams):
         beside = ("poses", "extrinsics", "times", "photos", "photo_times", "mask")
         files = {"sweeps": self.folder, "camera": self.camera_file} | {name: getattr(self, name) for name in beside}
         given = {name: here / path for name, path in files.items() if path is not None}
-        return given | (folder_inputs("photos", given["photos"]) if "photos" in given else {})
+        if "photos" in given:
+            given |= folder_inputs("photos", given["photos"])
+        return given
 
     def params(self) -> SweepsParams:
         """Parameters of the import, without files."""

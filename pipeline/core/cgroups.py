@@ -18,10 +18,10 @@ def folders(controller: str, root: Path = ROOT, membership: Path = MEMBERSHIP) -
         root: where control groups are mounted; version 1 has a folder for each controller below it.
         membership: the kernel's list of this process's groups, "ID:CONTROLLERS:PATH"; version 2 names no controllers.
     """
-    lines = ["0::/"]
+    text = ""
     with suppress(OSError):
-        lines = membership.read_text(encoding="utf-8", errors="replace").splitlines()
-    for line in lines:
+        text = membership.read_text(encoding="utf-8", errors="replace")
+    for line in text.splitlines() or ["0::/"]:
         _, controllers, path = line.split(":", 2)
         if controllers and controller not in controllers.split(","):
             continue
