@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import webbrowser
 from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,6 +14,7 @@ from rich.table import Table
 
 from scan2sim.flows.commands import qos_table
 from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.browser import open_page
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.ros_spin import stop_on_signal
@@ -236,7 +236,7 @@ def teleop_demo(
         if window:
             stack.enter_context(app_window.window(running.page))
         elif browse:
-            webbrowser.open(running.page)
+            open_page(running.page)
         while not stop.wait(0.5):
             running.supervise(_say)
 
