@@ -98,7 +98,7 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
         raise InputError(path, "file not found", "Check the path; give a video file, or a folder of images")
     av = _av()
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path.absolute())) as container:  # FFmpeg takes `12:30.mp4` for an address
             if not container.streams.video or container.streams.video[0].codec_context is None:
                 raise InputError(path, "has no readable video stream", "Give a video file, or a folder of images")
             stream = container.streams.video[0]
@@ -170,7 +170,7 @@ def _of_folder(video: Video) -> Iterator[Frame]:
 
 def _of_file(video: Video, warn: Callable[[str], None]) -> Iterator[Frame]:
     av = _av()
-    with av.open(str(video.path)) as container:
+    with av.open(str(video.path.absolute())) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         first: float | None = None

@@ -162,7 +162,7 @@ def extract_frames(
     folder.mkdir(parents=True, exist_ok=True)
     photos: list[Photo] = []
     first: float | None = None
-    opened: Any = av.open(str(path))
+    opened: Any = av.open(str(path.absolute()))
     with opened as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
