@@ -62,7 +62,7 @@ def rate_of(path: Path) -> float | None:
     """Frame rate of a video in Hz; None for images."""
     import cv2
 
-    return None if _holds_images(path) else cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS) or None
+    return None if _holds_images(path) else cv2.VideoCapture(str(path.absolute())).get(cv2.CAP_PROP_FPS) or None
 
 
 def count(path: Path) -> int:
@@ -75,7 +75,7 @@ def count(path: Path) -> int:
 
     if _holds_images(path):
         return len(_image_files(path))
-    return max(1, int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)))
+    return max(1, int(cv2.VideoCapture(str(path.absolute())).get(cv2.CAP_PROP_FRAME_COUNT)))
 
 
 def stored_images(path: Path) -> Iterator[StoredImage]:
@@ -90,7 +90,7 @@ def stored_images(path: Path) -> Iterator[StoredImage]:
         return
     import cv2
 
-    video = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(str(path.absolute()))
     rate, number = video.get(cv2.CAP_PROP_FPS) or 25.0, 0
     while (image := _read(video)) is not None:
         yield StoredImage(f"{number:06}", round(number / rate * 1e9), image)
