@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import scan2sim
@@ -22,6 +24,18 @@ def test_settings_may_be_nested_or_dotted() -> None:
     assert Settings.of({"decimate.target": 1, "decimate.building.target": 2}).values == nested.values
     with pytest.raises(scan2sim.ScanError, match=r"step\.param"):
         Settings.of({"decimate.building.target.x": 1})
+
+
+def test_settings_of_a_loop_may_be_numbers_of_numpy_and_paths() -> None:
+    values = Settings.of({"decimate.target": np.int64(50_000), "segment": {"model": Path("a"), "x": (np.float32(1),)}})
+    assert json.loads(json.dumps(values.values)) == values.values
+    assert values.values == {"decimate": {"target": 50_000}, "segment": {"model": "a", "x": [1.0]}}
+
+
+def test_dotted_and_nested_settings_of_one_step_are_merged() -> None:
+    dotted_first = Settings.of({"decimate.building.target": 2, "decimate": {"target": 1}})
+    nested_first = Settings.of({"decimate": {"target": 1}, "decimate.building.target": 2})
+    assert dotted_first.values == nested_first.values == {"decimate": {"target": 1, "building": {"target": 2}}}
 
 
 def test_run_returns_a_readable_world(small_street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
