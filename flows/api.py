@@ -42,10 +42,14 @@ class World:
     """A finished world on disk, of one tile or of a survey.
 
     Attributes:
-        folder: the output folder that was given to `run` or `survey`.
+        folder: absolute path of the output folder of `run` or `survey`, or of a copy of the folder `world` in it.
     """
 
     folder: Path
+
+    def __post_init__(self) -> None:
+        """Keep the folder when the process changes its working folder, as notebooks do."""
+        object.__setattr__(self, "folder", Path(self.folder).absolute())
 
     @cached_property
     def scene(self) -> Scene:
@@ -61,7 +65,7 @@ class World:
     @property
     def sdf(self) -> Path:
         """The Gazebo world (SDF 1.9)."""
-        return self.folder / "world" / f"{self.scene.name}.sdf"
+        return self.scene.tiles[0].folder.parents[1] / f"{self.scene.name}.sdf"
 
     @property
     def report(self) -> dict[str, Any]:
@@ -130,7 +134,7 @@ def survey(
 
     Args:
         source: a `survey.toml`, a `tile.toml` of a long road (it is cut into tiles), a `drive.toml`, or its folder.
-        out: folder for worlds, reports and cached results.
+        out: folder for worlds, reports and cached results, or its s3:// URL.
         settings: as for `run`.
         length: metres of road per tile, where the road is cut here; default: 100.
         buffer: metres by which the clouds of tiles overlap, where the road is cut here; default: 5.
@@ -139,7 +143,7 @@ def survey(
         progress: as for `run`.
 
     Returns:
-        The finished world.
+        The finished world; of a URL, in the copy on this machine.
 
     Raises:
         StepError: tiles failed; all others are finished.
@@ -149,8 +153,8 @@ def survey(
     from scan2sim.flows.commands.survey import run_source
 
     with _shown(progress):
-        run_source(str(source), str(out), _settings(settings, hold_out), length=length, buffer=buffer, jobs=jobs)
-    return read_world(out)
+        path = run_source(str(source), str(out), _settings(settings, hold_out), length=length, buffer=buffer, jobs=jobs)
+    return read_world(path.parent)
 
 
 def camera(world: World | str | Path, *, farthest: float = 300.0) -> WorldCamera:

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import scan2sim
+from scan2sim.flows.commands import survey as survey_command
 from scan2sim.flows.pipelines.settings import Settings
+from tests.fakes import synthetic
 from tests.flows.tiny import COARSE, tiny
 
 
@@ -56,3 +58,28 @@ def test_errors_have_place_cause_and_remedy(tmp_path: Path) -> None:
         scan2sim.survey(tmp_path, tmp_path / "out", {"carving.when": "never"})
     with pytest.raises(scan2sim.ScanError):
         scan2sim.read_world(tmp_path)
+
+
+def test_a_world_is_found_after_a_change_of_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synthetic.scene(tmp_path / "my_world")
+    monkeypatch.chdir(tmp_path)
+    world = scan2sim.read_world("my_world")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert world.folder == tmp_path / "my_world" and world.sdf.is_absolute()
+    assert all(len(shape) for shape in world.scene.tiles[0].textured().values())
+
+
+def test_the_folder_world_alone_is_a_world(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path / "my_world")
+    (inner,) = {tile.folder.parents[1] for tile in scene.tiles}
+    assert scan2sim.read_world(inner).sdf == scan2sim.read_world(tmp_path / "my_world").sdf
+    assert scan2sim.read_world(inner).sdf == inner / f"{scene.name}.sdf"
+
+
+def test_the_world_of_a_survey_in_object_storage_is_its_copy_on_this_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synthetic.scene(tmp_path)
+    monkeypatch.setattr(survey_command, "run_source", lambda *_, **__: tmp_path / "survey.html")
+    assert scan2sim.survey("s3://bucket/survey", "s3://bucket/worlds").folder == tmp_path
