@@ -112,6 +112,7 @@ def run(
     from scan2sim.flows.commands.run import run_tile
     from scan2sim.pipeline.importers.robot_map import MapParams
 
+    _check_ranges("run", hold_out=hold_out, jobs=jobs)
     with _shown(progress):
         path = Path(tile)
         path = tile_of_map(path, Path(out), MapParams()) if is_map(path) else path
@@ -152,6 +153,7 @@ def survey(
     """
     from scan2sim.flows.commands.survey import run_source
 
+    _check_ranges("survey", length=length, buffer=buffer, hold_out=hold_out, jobs=jobs)
     with _shown(progress):
         path = run_source(str(source), str(out), _settings(settings, hold_out), length=length, buffer=buffer, jobs=jobs)
     return read_world(path.parent)
@@ -189,6 +191,17 @@ def read_world(folder: str | Path) -> World:
     world = World(Path(folder))
     _ = world.scene
     return world
+
+
+def _check_ranges(function: str, **numbers: float | None) -> None:
+    """Check arguments of a function by the ranges of the command's options: with -1 jobs, no step would ever start.
+
+    Raises:
+        SettingError: names the argument and its range.
+    """
+    from scan2sim.flows.commands.option_ranges import NumericOptions
+
+    NumericOptions.of(function, numbers, remedy="docs/reference/python.md describes it")
 
 
 def _settings(values: Mapping[str, Any] | None, hold_out: int) -> Settings:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +39,15 @@ def test_dotted_and_nested_settings_of_one_step_are_merged() -> None:
     dotted_first = Settings.of({"decimate.building.target": 2, "decimate": {"target": 1}})
     nested_first = Settings.of({"decimate": {"target": 1}, "decimate.building.target": 2})
     assert dotted_first.values == nested_first.values == {"decimate": {"target": 1, "building": {"target": 2}}}
+
+
+@pytest.mark.parametrize("wrong", [{"jobs": -1}, {"hold_out": -8}, {"length": 0.0}, {"buffer": -1.0}])
+def test_numbers_out_of_range_are_rejected_before_anything_runs(wrong: dict[str, Any], tmp_path: Path) -> None:
+    """All cores are `jobs=0`; with the -1 of other libraries no step would start, for ever."""
+    function = "survey" if {"length", "buffer"} & wrong.keys() else "run"
+    with pytest.raises(scan2sim.ScanError, match=rf"{function}\.{next(iter(wrong))}: must be"):
+        getattr(scan2sim, function)(tmp_path / "tile", tmp_path / "out", progress=False, **wrong)
+    assert not (tmp_path / "out").exists()
 
 
 def test_run_returns_a_readable_world(small_street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
