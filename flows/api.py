@@ -15,7 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 from scan2sim.flows.pipelines.assembled import import_clouds
 from scan2sim.flows.pipelines.kitti import import_kitti_odometry, import_kitti_raw
-from scan2sim.pipeline.core.errors import InputError, ScanError
+from scan2sim.pipeline.core.errors import (
+    BusyError,
+    DataError,
+    IncompleteError,
+    InputError,
+    LowConfidenceError,
+    ScanError,
+    SettingError,
+    SpaceError,
+    StepError,
+    UnavailableError,
+)
 from scan2sim.pipeline.importers.photogrammetry import import_model as import_photogrammetry
 
 if TYPE_CHECKING:
@@ -24,7 +35,16 @@ if TYPE_CHECKING:
     from scan2sim.texturing.world_camera import WorldCamera
 
 __all__ = [
+    "BusyError",
+    "DataError",
+    "IncompleteError",
+    "InputError",
+    "LowConfidenceError",
     "ScanError",
+    "SettingError",
+    "SpaceError",
+    "StepError",
+    "UnavailableError",
     "World",
     "camera",
     "import_clouds",
@@ -105,7 +125,7 @@ def run(
         The finished world.
 
     Raises:
-        IncompleteError: the world is finished, side products (roads, pictures, ...) failed.
+        IncompleteError: the world is finished, `read_world(out)` opens it; side products (roads, pictures, ...) failed.
         ScanError: bad input or a failed step, with cause and remedy; results of earlier runs stay.
     """
     from scan2sim.flows.commands.robot_map import is_map, tile_of_map
@@ -147,8 +167,8 @@ def survey(
         The finished world; of a URL, in the copy on this machine.
 
     Raises:
-        StepError: tiles failed; all others are finished.
-        IncompleteError: the world is finished, side products failed.
+        StepError: tiles failed; all others are finished, `read_world(out)` opens their world.
+        IncompleteError: the world is finished, `read_world(out)` opens it; side products failed.
         ScanError: bad input, with cause and remedy; results of earlier runs stay.
     """
     from scan2sim.flows.commands.survey import run_source

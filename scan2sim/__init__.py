@@ -11,7 +11,16 @@ from scan2sim.pipeline.core import kernel_cache
 
 if TYPE_CHECKING:
     from scan2sim.flows.api import (
+        BusyError,
+        DataError,
+        IncompleteError,
+        InputError,
+        LowConfidenceError,
         ScanError,
+        SettingError,
+        SpaceError,
+        StepError,
+        UnavailableError,
         World,
         camera,
         import_clouds,
@@ -26,7 +35,16 @@ if TYPE_CHECKING:
 kernel_cache.choose()  # before numba is imported
 __version__ = "0.1.0"
 __all__ = [
+    "BusyError",
+    "DataError",
+    "IncompleteError",
+    "InputError",
+    "LowConfidenceError",
     "ScanError",
+    "SettingError",
+    "SpaceError",
+    "StepError",
+    "UnavailableError",
     "World",
     "__version__",
     "camera",
@@ -45,3 +63,8 @@ def __getattr__(name: str) -> Any:
     if name in __all__:
         return getattr(import_module("scan2sim.flows.api"), name)
     raise AttributeError(f"module 'scan2sim' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Names for completion in shells and notebooks: those that are loaded when they are first used, too."""
+    return sorted({*globals(), *__all__})

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +15,8 @@ import pytest
 import scan2sim
 from scan2sim.flows.commands import survey as survey_command
 from scan2sim.flows.pipelines.settings import Settings
+from scan2sim.pipeline.core.errors import EXIT_CODES
+from tests.conftest import ROOT
 from tests.fakes import synthetic
 from tests.flows.tiny import COARSE, tiny
 
@@ -20,6 +25,19 @@ def test_api_names_exist() -> None:
     assert all(getattr(scan2sim, name) for name in scan2sim.__all__)
     with pytest.raises(AttributeError, match="no_such_name"):
         scan2sim.no_such_name  # noqa: B018
+
+
+def test_shells_and_notebooks_complete_names_that_are_not_loaded_yet() -> None:
+    code = "import scan2sim; print(*dir(scan2sim), 'scan2sim.flows.api' in __import__('sys').modules)"
+    words = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    assert {*scan2sim.__all__, "False"} <= set(words.split())
+
+
+def test_every_documented_error_can_be_caught_by_its_name() -> None:
+    kinds = {kind for kind in EXIT_CODES if issubclass(kind, scan2sim.ScanError)} | {scan2sim.ScanError}
+    assert {getattr(scan2sim, kind.__name__) for kind in kinds} == kinds
+    page = (ROOT / "docs/reference/python.md").read_text(encoding="utf-8")
+    assert {kind.__name__ for kind in kinds} == set(re.findall(r"\b[A-Z]\w+Error\b", page))
 
 
 def test_settings_may_be_nested_or_dotted() -> None:
