@@ -7,6 +7,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 from rich.console import Console
@@ -19,7 +20,23 @@ from scan2sim.flows.pipelines.graph import Task
 from scan2sim.pipeline.core.errors import printable
 from scan2sim.pipeline.core.step import Report
 
-console = Console()
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+
+
+class _Console(Console):
+    """A console that may be quiet for a single run, while others in the same process print in their own threads."""
+
+    @property
+    def quiet(self) -> bool:
+        """Whether the running thread prints nothing."""
+        return _quiet.get()
+
+    @quiet.setter
+    def quiet(self, value: bool) -> None:
+        _quiet.set(value)
+
+
+console = _Console()
 
 
 def _progress() -> Progress:
@@ -33,7 +50,7 @@ def _progress() -> Progress:
         expand=True,
         console=console,
         transient=True,
-        disable=not console.is_terminal,
+        disable=console.quiet or not console.is_terminal,  # its thread would print, too
     )
 
 
