@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -32,6 +34,11 @@ def hang() -> None:
 
 
 def test_result_of_the_child_is_returned() -> None:
+    assert sandbox.call(f"{HERE}:double", 21, timeout=60) == 42
+
+
+def test_paths_that_are_no_text_are_skipped_as_python_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path, Path("notebooks")])
     assert sandbox.call(f"{HERE}:double", 21, timeout=60) == 42
 
 
