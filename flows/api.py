@@ -6,15 +6,24 @@ The commands of the same names call the same functions. Everything else may chan
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from scan2sim.flows.pipelines.assembled import import_clouds
-from scan2sim.flows.pipelines.kitti import import_kitti_odometry, import_kitti_raw
+from scan2sim.flows.importers import (
+    import_bag,
+    import_clouds,
+    import_images,
+    import_kitti_odometry,
+    import_kitti_raw,
+    import_map,
+    import_nuscenes,
+    import_pandaset,
+    import_photogrammetry,
+    import_sweeps,
+)
 from scan2sim.pipeline.core.errors import (
     BusyError,
     DataError,
@@ -27,7 +36,6 @@ from scan2sim.pipeline.core.errors import (
     StepError,
     UnavailableError,
 )
-from scan2sim.pipeline.importers.photogrammetry import import_model as import_photogrammetry
 
 if TYPE_CHECKING:
     from scan2sim.flows.pipelines.settings import Settings
@@ -47,10 +55,17 @@ __all__ = [
     "UnavailableError",
     "World",
     "camera",
+    "export",
+    "import_bag",
     "import_clouds",
+    "import_images",
     "import_kitti_odometry",
     "import_kitti_raw",
+    "import_map",
+    "import_nuscenes",
+    "import_pandaset",
     "import_photogrammetry",
+    "import_sweeps",
     "read_world",
     "run",
     "survey",
@@ -128,12 +143,13 @@ def run(
         IncompleteError: the world is finished, `read_world(out)` opens it; side products (roads, pictures, ...) failed.
         ScanError: bad input or a failed step, with cause and remedy; results of earlier runs stay.
     """
+    from scan2sim.flows.commands import display, option_ranges
     from scan2sim.flows.commands.robot_map import is_map, tile_of_map
     from scan2sim.flows.commands.run import run_tile
     from scan2sim.pipeline.importers.robot_map import MapParams
 
-    _check_ranges("run", hold_out=hold_out, jobs=jobs)
-    with _shown(progress):
+    option_ranges.check_arguments("run", hold_out=hold_out, jobs=jobs)  # with -1 jobs, no step would ever start
+    with display.shown(progress):
         path = Path(tile)
         path = tile_of_map(path, Path(out), MapParams()) if is_map(path) else path
         run_tile(path, Path(out), _settings(settings, hold_out), jobs=jobs)
@@ -171,12 +187,59 @@ def survey(
         IncompleteError: the world is finished, `read_world(out)` opens it; side products failed.
         ScanError: bad input, with cause and remedy; results of earlier runs stay.
     """
+    from scan2sim.flows.commands import display, option_ranges
     from scan2sim.flows.commands.survey import run_source
 
-    _check_ranges("survey", length=length, buffer=buffer, hold_out=hold_out, jobs=jobs)
-    with _shown(progress):
+    option_ranges.check_arguments("survey", length=length, buffer=buffer, hold_out=hold_out, jobs=jobs)
+    with display.shown(progress):
         path = run_source(str(source), str(out), _settings(settings, hold_out), length=length, buffer=buffer, jobs=jobs)
     return read_world(path.parent)
+
+
+def export(
+    world: World | str | Path,
+    formats: str | Sequence[str],
+    out: str | Path,
+    *,
+    budget: str | None = None,
+    levels: int | None = None,
+    robot: bool = False,
+    overwrite: bool = False,
+    progress: bool = True,
+    **options: Any,
+) -> Path:
+    """Convert a finished world to other formats, for other simulators: `scan2sim export`, docs/simulators.md.
+
+    Args:
+        world: the world, or the output folder of `run` or `survey`.
+        formats: "gazebo", "glb", ...: one, several separated by commas, or a list.
+        out: folder for the converted world.
+        budget: limits of each tile, such as "triangles=200k,texture=64MP"; default: none.
+        levels: levels of detail of each tile, 1 to 6; default: 3 for tiles3d, else 1.
+        robot: add a small robot with camera and lidar, on the road.
+        overwrite: replace an existing export.
+        progress: show progress and warnings on the terminal.
+        options: further options of the command, with underscores: `pages="jpeg"`, `double_sided=False`.
+
+    Returns:
+        The folder.
+
+    Raises:
+        SettingError: unknown format or option, or `out` is not empty. InputError: there is no finished world.
+        UnavailableError: a format's package is missing.
+    """
+    from scan2sim.flows.commands import display, option_ranges
+    from scan2sim.flows.commands.export import export_world
+    from scan2sim.pipeline.io.world_formats import SceneParams
+
+    option_ranges.check_arguments("export", levels=levels)
+    params = SceneParams.of("export", options, remedy="`scan2sim export --help` describes the options")
+    folder = world.folder if isinstance(world, World) else Path(world)
+    with display.shown(progress):
+        return export_world(
+            folder, formats, Path(out).absolute(), params, budget=budget, levels=levels, robot=robot,
+            overwrite=overwrite,
+        )  # fmt: skip
 
 
 def camera(world: World | str | Path, *, farthest: float = 300.0) -> WorldCamera:
@@ -213,31 +276,8 @@ def read_world(folder: str | Path) -> World:
     return world
 
 
-def _check_ranges(function: str, **numbers: float | None) -> None:
-    """Check arguments of a function by the ranges of the command's options: with -1 jobs, no step would ever start.
-
-    Raises:
-        SettingError: names the argument and its range.
-    """
-    from scan2sim.flows.commands.option_ranges import NumericOptions
-
-    NumericOptions.of(function, numbers, remedy="docs/reference/python.md describes it")
-
-
 def _settings(values: Mapping[str, Any] | None, hold_out: int) -> Settings:
     from scan2sim.flows.pipelines.settings import Settings
 
     held_out = {f"{step}.hold_out": hold_out for step in ("views", "sweeps")} if hold_out else {}
     return Settings.of({**(values or {}), **held_out})
-
-
-@contextmanager
-def _shown(progress: bool) -> Iterator[None]:
-    """Show or hide the output of the command while the context is active."""
-    from scan2sim.flows.commands.display import console
-
-    before, console.quiet = console.quiet, not progress
-    try:
-        yield
-    finally:
-        console.quiet = before

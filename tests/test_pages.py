@@ -16,6 +16,7 @@ import pytest
 import typer
 from pydantic import BaseModel, ValidationError
 
+import scan2sim
 from scan2sim.flows.cli import COMMANDS, app, loaded
 from scan2sim.flows.pipelines.drive import Drive
 from scan2sim.flows.pipelines.steps import STEPS
@@ -242,3 +243,12 @@ def test_the_page_of_inputs_lists_every_import() -> None:
     text = (ROOT / "docs/inputs.md").read_text(encoding="utf-8")
     imports = {word for word, command in loaded("import").commands.items() if not command.hidden}
     assert set(re.findall(r"scan2sim import ([\w-]+)", text)) == imports
+
+
+def test_the_page_of_python_describes_every_function() -> None:
+    text = (ROOT / "docs/reference/python.md").read_text(encoding="utf-8")
+    (members,) = re.findall(r"members: \[(.*)\]", text)
+    names = {name for name in scan2sim.__all__ if not name.endswith("Error") and name != "__version__"}
+    assert set(members.split(", ")) == names
+    imports = {name for name in names if name.startswith("import_")}
+    assert set(re.findall(r"`(import_\w+)`", text)) == imports

@@ -39,6 +39,16 @@ class _Console(Console):
 console = _Console()
 
 
+@contextmanager
+def shown(progress: bool) -> Iterator[None]:
+    """Print what happens in the context, or nothing; other threads print as they do."""
+    before, console.quiet = console.quiet, not progress
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
 def _progress() -> Progress:
     return Progress(
         SpinnerColumn(),

@@ -8,7 +8,6 @@ from threading import Event, Thread
 import pytest
 from rich.console import Console
 
-from scan2sim.flows.api import _shown
 from scan2sim.flows.commands import display
 
 
@@ -30,7 +29,7 @@ def test_a_quiet_run_silences_neither_runs_in_other_threads_nor_those_after_it(
     first_began, second_began, first_ended = Event(), Event(), Event()
 
     def first() -> None:
-        with _shown(False):
+        with display.shown(False):
             first_began.set()
             second_began.wait()
             display.warn("of the first")
@@ -38,7 +37,7 @@ def test_a_quiet_run_silences_neither_runs_in_other_threads_nor_those_after_it(
 
     def second() -> None:
         first_began.wait()
-        with _shown(True):
+        with display.shown(True):
             second_began.set()
             first_ended.wait()
             display.warn("of the second")
@@ -56,5 +55,5 @@ def test_a_quiet_run_silences_neither_runs_in_other_threads_nor_those_after_it(
 def test_a_quiet_run_has_no_progress_bars(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(display.console, "_force_terminal", True)
     assert not display._progress().disable
-    with _shown(False):
+    with display.shown(False):
         assert display._progress().disable
