@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from scan2sim.pipeline.camera.renderer import SKY_RGB, Body, Image, Renderer, placed
 from scan2sim.pipeline.core.classes import CODE, CODE_OF_SURFACE
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.splats import XYZ, SplatLayer, Splats
 from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, Colour
 from scan2sim.pipeline.io.worlds.instances import Instance, TileInstances, box_ids, instances_of
@@ -81,7 +83,12 @@ class WorldCamera:
             T_world_cam: (4, 4) pose in world metres; camera axes x right, y down, z ahead.
             camera: any perspective model.
             samples: rays per pixel along each axis, of surfaces.
+
+        Raises:
+            SettingError: `T_world_cam` is no pose.
+            InputError: a file of the world is missing or damaged.
         """
+        T_world_cam = _pose(T_world_cam)
         self._load(T_world_cam[:3, 3])
         seen = self._surfaces.view(camera, T_world_cam, samples=samples if self._surfaces.are_shown else 1)
         code, instance = self._surfaces.codes(seen), self._surfaces.instances(seen)
@@ -108,6 +115,7 @@ class WorldCamera:
 
     def colours(self, T_world_cam: F64, camera: Camera, *, samples: int = 2) -> U8:
         """Colours (H, W, 3) of a view, as `render` gives them; faster where all tiles have splats."""
+        T_world_cam = _pose(T_world_cam)
         self._load(T_world_cam[:3, 3])
         if self._splats is None or self._surfaces.are_shown:
             return self.render(T_world_cam, camera, samples=samples).rgb
@@ -137,6 +145,7 @@ class WorldCamera:
         order, distance = self._layout.by_distance(position)
         near = sorted(order[: max(1, int(np.count_nonzero(distance <= self._farthest)))])
         if near != self._near:
+            self._near = []  # if a file of a tile can't be read, the next view prepares its tiles again
             self._layers = {k: self._layers[k] if k in self._layers else _placed(self._scene.tiles[k]) for k in near}
             tiles, shown = [self._scene.tiles[k] for k in near], [self._layers[k] is None for k in near]
             bodies = [_bodies(tile) for tile in tiles]
@@ -157,6 +166,19 @@ class WorldCamera:
             self._splats.behind = (
                 [(Background(BLACK), 1.0)] if black else [(self._backgrounds[k], share) for k, share in shares.items()]
             )
+
+
+def _pose(T_world_cam: npt.ArrayLike) -> F64:
+    """The pose (4, 4) as an array.
+
+    Raises:
+        SettingError: it has another shape, or contains NaN or infinity.
+    """
+    T = np.asarray(T_world_cam, np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        cause = f"is no pose: shape {T.shape}" + ("" if T.shape != (4, 4) else ", with NaN or infinity")
+        raise SettingError("T_world_cam", cause, "Give a finite matrix (4, 4), camera to world")
+    return T
 
 
 @dataclass(frozen=True)
