@@ -36,6 +36,7 @@ from scan2sim.pipeline.core.errors import (
     StepError,
     UnavailableError,
 )
+from scan2sim.pipeline.core.types import Camera
 
 if TYPE_CHECKING:
     from scan2sim.flows.pipelines.settings import Settings
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BusyError",
+    "Camera",
     "DataError",
     "IncompleteError",
     "InputError",
@@ -252,9 +254,9 @@ def camera(world: World | str | Path, *, farthest: float = 300.0) -> WorldCamera
         farthest: distance from the camera in metres beyond which tiles aren't drawn; the nearest one always is.
 
     Example:
-        `image = scan2sim.camera("my_world").render(T_world_cam, camera)`, with a pose (4, 4) in world metres (camera
-        axes x right, y down, z ahead) and a `scan2sim.pipeline.core.types.Camera`; `image.rgb`, `image.depth(camera)`,
-        `image.code`, `image.instance` (ids of `camera.instances`).
+        `image = scan2sim.camera("my_world").render(T_world_cam, lens)`, with a pose (4, 4) in world metres (camera axes
+        x right, y down, z ahead) and a `scan2sim.Camera`, the lens; `image.rgb`, `image.depth(lens)`, `image.code`,
+        `image.instance` (ids of `instances` of what this function returns).
 
     Raises:
         InputError: the folder contains no world.

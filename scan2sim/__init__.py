@@ -12,6 +12,7 @@ from scan2sim.pipeline.core import kernel_cache
 if TYPE_CHECKING:
     from scan2sim.flows.api import (
         BusyError,
+        Camera,
         DataError,
         IncompleteError,
         InputError,
@@ -43,6 +44,7 @@ kernel_cache.choose()  # before numba is imported
 __version__ = "0.1.0"
 __all__ = [
     "BusyError",
+    "Camera",
     "DataError",
     "IncompleteError",
     "InputError",
