@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import shlex
 import subprocess
@@ -252,3 +253,15 @@ def test_the_page_of_python_describes_every_function() -> None:
     assert set(members.split(", ")) == names
     imports = {name for name in names if name.startswith("import_")}
     assert set(re.findall(r"`(import_\w+)`", text)) == imports
+
+
+@pytest.mark.parametrize("page", page_params([page for page in PAGES if "```python" in text_of(page)]))
+def test_python_on_the_pages_imports_existing_names(page: Path) -> None:
+    for block in re.findall(r"```python\n(.*?)```", text_of(page), re.DOTALL):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("scan2sim"):
+                module = importlib.import_module(str(node.module))
+                missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                assert not missing, f"{node.module} has no {missing}"
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "scan2sim":
+                assert node.attr in scan2sim.__all__, f"scan2sim has no public name {node.attr}"
