@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,7 @@ from scan2sim.pipeline.camera.renderer import SKY_RGB, Body, Image, Renderer, pl
 from scan2sim.pipeline.core.classes import CODE, CODE_OF_SURFACE
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.splats import XYZ, SplatLayer, Splats
-from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, Colour
+from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, CameraModel, Colour
 from scan2sim.pipeline.io.worlds.instances import Instance, TileInstances, box_ids, instances_of
 from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile
 from scan2sim.texturing.splats.background import Background
@@ -85,10 +86,11 @@ class WorldCamera:
             samples: rays per pixel along each axis, of surfaces.
 
         Raises:
-            SettingError: `T_world_cam` is no pose.
+            SettingError: `T_world_cam` is no pose, or the camera has no focal length or an unknown model.
             InputError: a file of the world is missing or damaged.
         """
         T_world_cam = _pose(T_world_cam)
+        _check_lens(camera)
         self._load(T_world_cam[:3, 3])
         seen = self._surfaces.view(camera, T_world_cam, samples=samples if self._surfaces.are_shown else 1)
         code, instance = self._surfaces.codes(seen), self._surfaces.instances(seen)
@@ -116,6 +118,7 @@ class WorldCamera:
     def colours(self, T_world_cam: F64, camera: Camera, *, samples: int = 2) -> U8:
         """Colours (H, W, 3) of a view, as `render` gives them; faster where all tiles have splats."""
         T_world_cam = _pose(T_world_cam)
+        _check_lens(camera)
         self._load(T_world_cam[:3, 3])
         if self._splats is None or self._surfaces.are_shown:
             return self.render(T_world_cam, camera, samples=samples).rgb
@@ -179,6 +182,21 @@ def _pose(T_world_cam: npt.ArrayLike) -> F64:
         cause = f"is no pose: shape {T.shape}" + ("" if T.shape != (4, 4) else ", with NaN or infinity")
         raise SettingError("T_world_cam", cause, "Give a finite matrix (4, 4), camera to world")
     return T
+
+
+def _check_lens(camera: Camera) -> None:
+    """Reject a camera that sees nothing.
+
+    Raises:
+        SettingError: its model is unknown, or it has no focal length or no pixels.
+    """
+    models = get_args(CameraModel)
+    if camera.model not in models:
+        raise SettingError("camera", f"has the unknown model {camera.model!r}", f"Use {', '.join(models)}")
+    if min(camera.width, camera.height) < 1:
+        raise SettingError("camera", f"has {camera.width} x {camera.height} pixels", "Give its size in pixels")
+    if camera.model != "equirectangular" and not min(camera.fx, camera.fy) > 0:
+        raise SettingError("camera", "has no focal length", "Give fx and fy in pixels, and cx and cy")
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -90,6 +90,20 @@ def test_what_is_no_pose_is_rejected(town: Scene, wrong: np.ndarray) -> None:
     assert np.array_equal(
         WorldCamera(town).render(POSE.tolist(), CAMERA).rgb, WorldCamera(town).render(POSE, CAMERA).rgb
     )
+
+
+@pytest.mark.parametrize(
+    ("lens", "problem"),
+    [
+        (Camera("pinhole", 64, 48), "no focal length"),
+        (Camera("pinhole", 64, 0, 50, 50), "64 x 0 pixels"),
+        (replace(CAMERA, model=cast(Any, "pin-hole")), "unknown model 'pin-hole'"),
+    ],
+)
+def test_a_camera_that_sees_nothing_is_rejected(town: Scene, lens: Camera, problem: str) -> None:
+    for view in (WorldCamera(town).render, WorldCamera(town).colours):
+        with pytest.raises(scan2sim.SettingError, match=problem):
+            view(POSE, lens)
 
 
 def test_views_elsewhere_continue_after_a_tile_that_cannot_be_read(town: Scene) -> None:
