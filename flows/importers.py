@@ -171,7 +171,7 @@ def import_kitti_raw(
     out: str | Path,
     *,
     poses: str | Path | None = None,
-    cameras: Sequence[str] = ("image_02",),
+    cameras: str | Sequence[str] = ("image_02",),
     frames: tuple[int, int] | None = None,
     pose_source: PoseSource = "auto",
     max_range: float = 50.0,
@@ -194,7 +194,7 @@ def import_kitti_raw(
             its parent.
         out: folder of the tile to create.
         poses: row-major 3x4 matrices, one per line, scanner of sweep i to scanner of sweep 0; default: OXTS poses.
-        cameras: folders of photos.
+        cameras: folder of photos, or several.
         frames: first and last frame number; default: all frames.
         pose_source: "given" uses the poses as they are; "auto" checks them against the sweeps, and corrects them if
             surfaces that were scanned at different times agree clearly better then; "fused" always corrects them.
@@ -215,8 +215,8 @@ def import_kitti_raw(
 
     make = partial(kitti.import_kitti_raw, Path(drive), deskew=deskew)
     return _kitti(
-        "import_kitti_raw", make, out, progress, warn, report, max_range, vertical_angle_offset, poses=_path(poses),
-        cameras=cameras, frames=frames, pose_source=pose_source, name=name, link=link, overwrite=overwrite,
+        "import_kitti_raw", make, out, progress, warn, report, cameras, max_range, vertical_angle_offset,
+        poses=_path(poses), frames=frames, pose_source=pose_source, name=name, link=link, overwrite=overwrite,
     )  # fmt: skip
 
 
@@ -225,7 +225,7 @@ def import_kitti_odometry(
     out: str | Path,
     *,
     poses: str | Path | None = None,
-    cameras: Sequence[str] = ("image_2",),
+    cameras: str | Sequence[str] = ("image_2",),
     frames: tuple[int, int] | None = None,
     pose_source: PoseSource = "auto",
     max_range: float = 50.0,
@@ -256,9 +256,8 @@ def import_kitti_odometry(
 
     make = partial(kitti.import_kitti_odometry, Path(sequence))
     return _kitti(
-        "import_kitti_odometry", make, out, progress, warn, report, max_range, vertical_angle_offset,
-        poses=_path(poses), cameras=cameras, frames=frames, pose_source=pose_source, name=name, link=link,
-        overwrite=overwrite,
+        "import_kitti_odometry", make, out, progress, warn, report, cameras, max_range, vertical_angle_offset,
+        poses=_path(poses), frames=frames, pose_source=pose_source, name=name, link=link, overwrite=overwrite,
     )  # fmt: skip
 
 
@@ -510,6 +509,7 @@ def _kitti(
     progress: bool,
     warn: Warn | None,
     report: Report | None,
+    cameras: str | Sequence[str],
     max_range: float,
     vertical_angle_offset: float,
     **given: Any,
@@ -520,6 +520,7 @@ def _kitti(
 
     numbers = {"max_range": max_range, "vertical_angle_offset": vertical_angle_offset}
     option_ranges.check_arguments(function, **numbers)
+    given["cameras"] = [cameras] if isinstance(cameras, str) else cameras
 
     def make_and_check(warn: Warn, report: Report) -> Path:
         tile = make(Path(out).absolute(), warn=warn, report=report, **numbers, **given)

@@ -21,6 +21,8 @@ from tests.fakes.datasets import Drive, write_pandaset
 from tests.flows.inline_steps import inline_steps
 from tests.pipeline.importers.bag.test_unpack import SWEEPS, write
 from tests.pipeline.importers.test_clouds_and_photos import CAMERA, VALUES, cloud, photos
+from tests.pipeline.importers.test_kitti_odometry import make_sequence
+from tests.pipeline.importers.test_kitti_raw import FRAMES, make_drive
 from tests.pipeline.importers.test_robot_map import room, save
 from tests.present import present
 
@@ -107,6 +109,15 @@ def test_a_sequence_of_pandaset_is_imported_with_options(tmp_path: Path) -> None
     folder = write_pandaset(tmp_path / "001", Drive())
     tile = scan2sim.import_pandaset(str(folder), tmp_path / "out" / "tile", camera=["none"], crs="local")
     assert not read_tile(tile).views and tile.parent == tmp_path / "out" / "tile"
+
+
+def test_drives_of_kitti_take_text_and_the_name_of_a_single_camera(tmp_path: Path) -> None:
+    drive, sequence = str(make_drive(tmp_path).folder), str(make_sequence(tmp_path))
+    raw = scan2sim.import_kitti_raw(drive, str(tmp_path / "raw"), cameras="image_02", pose_source="given")
+    odometry = scan2sim.import_kitti_odometry(sequence, str(tmp_path / "odometry"), cameras="image_2", frames=(0, 2))
+    assert len(read_tile(raw).views) == FRAMES and len(read_tile(odometry).views) == 3
+    with pytest.raises(scan2sim.SettingError, match=r"import_kitti_raw\.max_range: must be"):
+        scan2sim.import_kitti_raw(drive, tmp_path / "other", max_range=-1)
 
 
 def test_a_map_is_imported_with_its_axis_and_unit(tmp_path: Path) -> None:
