@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import get_args
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.camera.renderer import SKY_RGB, Body, Image, Renderer, placed
 from scan2sim.pipeline.core.classes import CODE, CODE_OF_SURFACE
-from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.splats import XYZ, SplatLayer, Splats
 from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, CameraModel, Colour
 from scan2sim.pipeline.io.worlds.instances import Instance, TileInstances, box_ids, instances_of
-from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile
+from scan2sim.pipeline.io.worlds.scene import BACKDROP, EXPORT_AGAIN, Scene, SceneTile
 from scan2sim.texturing.splats.background import Background
 from scan2sim.texturing.splats.view import SplatRenderer
 
@@ -87,7 +91,7 @@ class WorldCamera:
 
         Raises:
             SettingError: `T_world_cam` is no pose, or the camera has no focal length or an unknown model.
-            InputError: a file of the world is missing or damaged.
+            InputError: the surfaces or the splats of a tile are missing or damaged.
         """
         T_world_cam = _pose(T_world_cam)
         _check_lens(camera)
@@ -236,10 +240,24 @@ _Bodies = dict[str, tuple[Body, U8]]
 """Textured surfaces of a tile in world metres, and the LAS codes of their faces, by group."""
 
 
+@contextmanager
+def _readable(folder: Path) -> Iterator[None]:
+    """Convert the errors of a file in a folder of the world that is missing or damaged.
+
+    Raises:
+        InputError: names the folder.
+    """
+    try:
+        yield
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(folder, f"can't be read ({error})", EXPORT_AGAIN) from error
+
+
 def _bodies(tile: SceneTile) -> _Bodies:
     found: _Bodies = {}
     for group in tile.groups:
-        body = placed(tile.folder / group, tile.offset)
+        with _readable(tile.folder / group):
+            body = placed(tile.folder / group, tile.offset)
         own, codes = tile.codes.get(group, CODE_OF_SURFACE[group]), body.mesh.classification
         whole = np.full(len(body.mesh), own, np.uint8)
         found[group] = body, whole if codes is None else np.where(codes == 0, whole, codes)
@@ -296,7 +314,8 @@ def _backdrops(tiles: list[SceneTile], sky: Colour | None) -> Renderer | None:
 
 def _placed(tile: SceneTile) -> SplatLayer | None:
     """The splats of a tile in world metres; None: it has none."""
-    layer = tile.splats()
+    with _readable(tile.folder):
+        layer = tile.splats()
     if layer is None:
         return None
     layer.splats.parameters[:, XYZ] += np.asarray(tile.offset, np.float32)
