@@ -7,6 +7,7 @@ import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 from rich.console import Console
 from rich.markup import escape
@@ -18,7 +19,33 @@ from scan2sim.flows.pipelines.graph import Task
 from scan2sim.pipeline.core.errors import printable
 from scan2sim.pipeline.core.step import Report
 
-console = Console()
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+
+
+class _Console(Console):
+    """A console that may be quiet for a single run, while others in the same process print in their own threads."""
+
+    @property
+    def quiet(self) -> bool:
+        """Whether the running thread prints nothing."""
+        return _quiet.get()
+
+    @quiet.setter
+    def quiet(self, value: bool) -> None:
+        _quiet.set(value)
+
+
+console = _Console()
+
+
+@contextmanager
+def shown(progress: bool) -> Iterator[None]:
+    """Print what happens in the context, or nothing; other threads print as they do."""
+    before, console.quiet = console.quiet, not progress
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def _progress() -> Progress:
@@ -32,7 +59,7 @@ def _progress() -> Progress:
         expand=True,
         console=console,
         transient=True,
-        disable=not console.is_terminal,
+        disable=console.quiet or not console.is_terminal,  # its thread would print, too
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -83,7 +83,27 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing export.")] = False,
 ) -> None:
     """Convert a finished world to other formats, for other simulators."""
-    formats = list(dict.fromkeys(filter(None, map(str.strip, to.split(",")))))
+    export_world(world, to, out, params, budget=budget, levels=levels, robot=robot, overwrite=overwrite)
+
+
+def export_world(
+    world: Path,
+    to: str | Sequence[str],
+    out: Path,
+    params: SceneParams,
+    *,
+    budget: str | None = None,
+    levels: int | None = None,
+    robot: bool = False,
+    overwrite: bool = False,
+) -> Path:
+    """Convert the world in a folder to formats, a list or a text with commas; returns `out`.
+
+    Raises:
+        ScanError: unknown format, a missing package, no world, or `out` is not empty.
+    """
+    words = to.split(",") if isinstance(to, str) else to
+    formats = list(dict.fromkeys(filter(None, map(str.strip, words))))
     if not formats:
         raise SettingError("--to", "names no format", f"Choose from: {', '.join(world_formats.format_names())}")
     world_formats.check(formats, params, "--to", robot)
@@ -99,3 +119,4 @@ def export(
     if scene.frame.crs == LOCAL:
         warn(f"{scene.name} has no CRS: the export is not georeferenced")
     console.print(f"World:  {out}", highlight=False, soft_wrap=True)
+    return out

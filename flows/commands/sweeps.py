@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from scan2sim.flows.commands.display import console, warn
@@ -17,13 +17,14 @@ from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.worlds.merge import link
 
 
-def run_before_import(tasks: Sequence[Task], out: Path) -> dict[str, Path]:
+def run_before_import(tasks: Sequence[Task], out: Path, warn: Callable[[str], None] = warn) -> dict[str, Path]:
     """Run all tasks but the last, the import, and print a summary; finished tasks are cached.
 
     Args:
         tasks: those to run, in order.
         out: folder for cached results, and for an estimated trajectory in all formats; unused if there is only the
             import.
+        warn: receives the warnings of the tasks; default: the terminal.
 
     Returns:
         Inputs of the import by name.
@@ -32,10 +33,12 @@ def run_before_import(tasks: Sequence[Task], out: Path) -> dict[str, Path]:
         ScanError: raised by a step.
     """
     *before, last = tasks
-    return run_cached(before, last.inputs, out)
+    return run_cached(before, last.inputs, out, warn)
 
 
-def run_cached(tasks: Sequence[Task], wanted: Mapping[str, Path | Output], out: Path) -> dict[str, Path]:
+def run_cached(
+    tasks: Sequence[Task], wanted: Mapping[str, Path | Output], out: Path, warn: Callable[[str], None] = warn
+) -> dict[str, Path]:
     """Run tasks as `run_before_import`; returns the paths of `wanted` files and outputs."""
     found = {name: source for name, source in wanted.items() if isinstance(source, Path)}
     if not tasks:

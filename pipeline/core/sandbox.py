@@ -33,7 +33,8 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
         StepError: the child crashed, raised, or ran out of time.
     """
     # the parent's search path: modules in the user's working folder must not shadow ours
-    environment = dict(os.environ, OMP_WAIT_POLICY="passive", PYTHONPATH=os.pathsep.join(filter(None, sys.path)))
+    folders = [folder for folder in sys.path if isinstance(folder, str) and folder]  # Python skips others, too
+    environment = dict(os.environ, OMP_WAIT_POLICY="passive", PYTHONPATH=os.pathsep.join(folders))
     if threads is not None:
         environment |= {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
     with anonymous_file() as given, anonymous_file() as returned:

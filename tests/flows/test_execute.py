@@ -543,44 +543,52 @@ def test_versions_without_package_metadata(monkeypatch: pytest.MonkeyPatch) -> N
     assert versions.__wrapped__() == {"python": sys.version.split()[0], "scan2sim": scan2sim.__version__}
 
 
-@pytest.fixture
-def script(source: Path, tmp_path: Path) -> Path:
-    """A user's program that runs the toy graph."""
-    path = tmp_path / "my_script.py"
-    path.write_text(
-        f"""
+SCRIPT = """
+import os, sys
 from pathlib import Path
+
+sys.path[:0] = [{root!r}]
+sys.path.append(Path("no text, so Python skips it"))
+
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import plan
 from scan2sim.pipeline.core.cache import Store
 from tests.flows.toy import chain
 
-folder, store = Path({str(tmp_path)!r}), Store(Path({str(tmp_path)!r}) / "store")
+before = dict(os.environ), sys.warnoptions[:], [*sys.path]
+folder, store = Path({folder!r}), Store(Path({folder!r}) / "store")
 print("runs", flush=True)
-outcome = execute(plan(chain(Path({str(source)!r}), folder / "log"), store), store, jobs=2, on_event=lambda *_: None)
+outcome = execute(plan(chain(Path({source!r}), folder / "log"), store), store, jobs=2, on_event=lambda *_: None)
 outcome.check()
 print("total", outcome.of_tile()["d"].metrics["total"])
-""",
-        encoding="utf-8",
-    )
-    return path
+print("unchanged" if before == (dict(os.environ), sys.warnoptions, sys.path) else "changed")
+"""
 
 
-def printed_by(script: Path, **environment: str) -> list[str]:
-    """Words that a script prints."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, env=environment)
+def test_a_script_beside_neither_its_packages_nor_its_data(source: Path, tmp_path: Path) -> None:
+    """As `scan2sim.run` is used, without a guard of the main part: steps' processes must not run the script again.
+
+    The script finds the package by `sys.path`, and the folder of the data has a module named as one of Python's own.
+    """
+    data, script = tmp_path / "data", tmp_path / "scripts" / "my_script.py"
+    for folder in (data, script.parent):
+        folder.mkdir()
+    (data / "random.py").write_text("raise SystemExit('shadowed')", encoding="utf-8")
+    text = SCRIPT.format(root=str(ROOT), folder=str(tmp_path), source=str(source))
+    script.write_text(text, encoding="utf-8")
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
+    done = subprocess.run([sys.executable, script], cwd=data, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr
-    return done.stdout.split()
+    assert done.stdout.split() == ["runs", "total", "2", "unchanged"]
 
 
-def test_a_script_without_a_guard_of_its_main_part_runs_once(script: Path) -> None:
-    """As `scan2sim.run` is used: processes of steps must not run the script again."""
-    assert printed_by(script) == ["runs", "total", "2"]
-
-
-def test_steps_run_where_the_path_of_the_temporary_folder_is_too_long_for_sockets(script: Path, tmp_path: Path) -> None:
-    folder = tmp_path / ("job" * 30)
+def test_steps_run_where_the_path_of_the_temporary_folder_is_too_long_for_sockets(source: Path, tmp_path: Path) -> None:
+    folder, script = tmp_path / ("job" * 30), tmp_path / "my_script.py"
     folder.mkdir()
-    assert printed_by(script, TMPDIR=str(folder)) == ["runs", "total", "2"]
+    script.write_text(SCRIPT.format(root=str(ROOT), folder=str(tmp_path), source=str(source)), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, env=os.environ | {"TMPDIR": str(folder)}
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["runs", "total", "2", "unchanged"]
     assert not list(folder.iterdir())

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -55,6 +57,11 @@ def test_a_child_runs_where_there_is_no_folder_for_temporary_files(monkeypatch: 
     monkeypatch.setattr("tempfile.tempdir", "/nowhere")
     values = list(range(300_000))
     assert sandbox.call(f"{HERE}:same", values, timeout=60) == values
+
+
+def test_paths_that_are_no_text_are_skipped_as_python_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path, Path("notebooks")])
+    assert sandbox.call(f"{HERE}:double", 21, timeout=60) == 42
 
 
 def test_crash_is_reported_as_an_error() -> None:
