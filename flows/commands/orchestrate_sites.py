@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
-from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.app import App, Json
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json
 from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, say
 from scan2sim.services.credentials import redacted
 from scan2sim.services.orchestration.settings import Connection, OperationParams
+
+if TYPE_CHECKING:
+    from scan2sim.services.orchestration.records import SiteRecord
 
 REQUIREMENT = ("orchestration", "httpx", "yaml", "jsonschema")
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name in OSM.")]
@@ -115,23 +118,35 @@ def _add(params: OperationParams, which: str, body: Callable[[Any], dict[str, An
     say(f"{made['name']} is {'added' if new else 'already in OSM, and unchanged'}")
 
 
+def _facts(one: SiteRecord) -> dict[str, str]:
+    return {
+        "name": one.name,
+        "id": one.record,
+        "kind": one.vim_type or one.type,
+        "address": redacted(one.vim_url or one.url),
+        "state": one.admin.operational_state.lower(),
+        "detail": one.admin.detail,
+    }
+
+
 def _declare(group: App, which: str) -> None:
     """Declare `list` and `remove` of a group."""
 
     @group.command("list")
     @options(Connection)
-    def list_(params: Connection) -> None:
+    def list_(params: Connection, as_json: Json = False) -> None:
         """List names, addresses and states."""
         from scan2sim.services.orchestration import sites
 
-        with osm_client(params) as osm:
+        with messages_on_stderr(as_json), osm_client(params) as osm:
             found = osm.sites(sites.COLLECTIONS[which])
+        if as_json:
+            print_json([_facts(one) for one in found])
+            return
         table = Table("name", "kind", "address", "state")
-        for one in found:
-            state = one.admin.operational_state.lower()
-            reason = f": {one.admin.detail[:200]}" if state == "error" and one.admin.detail else ""
-            cells = (one.name, one.vim_type or one.type, redacted(one.vim_url or one.url), state + reason)
-            table.add_row(*map(escape, cells))
+        for one in map(_facts, found):
+            reason = f": {one['detail'][:200]}" if one["state"] == "error" and one["detail"] else ""
+            table.add_row(*map(escape, (one["name"], one["kind"], one["address"], one["state"] + reason)))
         console.print(table)
 
     @group.command("remove")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -153,3 +154,21 @@ def test_progress_is_printed_without_a_terminal(fake: FakeOsm, tmp_path: Path) -
     )
     lines = run(fake, "apply", path, "--wait").splitlines()
     assert "a: one: create" in lines and "a: one: instantiate" in lines
+
+
+def test_plan_and_apply_print_json_only_on_standard_output(fake: FakeOsm, town: Path) -> None:
+    def as_json(*words: object) -> Any:
+        return json.loads(CliRunner().invoke(app, [*map(str, words), "--json", "--osm", fake.address]).stdout)
+
+    planned = as_json("plan", town)
+    assert {"name": "detect-north", "action": "create", "reason": "not in OSM"} in planned
+    applied = as_json("apply", town, "--wait")
+    assert {one["name"] for one in applied["done"]} == {one["name"] for one in planned} and not applied["failed"]
+    assert as_json("plan", town) == [] and as_json("apply", town) == {"done": [], "failed": {}}
+
+
+def test_failures_of_apply_are_in_its_json(fake: FakeOsm, town: Path) -> None:
+    fake.state.outcome = lambda kind, name: "FAILED" if (kind, name) == ("instantiate", "detect-north") else "COMPLETED"
+    done = CliRunner().invoke(app, ["apply", str(town), "--wait", "--json", "--osm", fake.address])
+    failed = json.loads(done.stdout)["failed"]
+    assert done.exit_code and list(failed) == ["detect-north"] and "no quota" in failed["detect-north"]
