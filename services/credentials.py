@@ -36,7 +36,7 @@ def redacted(text: str) -> str:
 
 
 def is_secret(name: str) -> bool:
-    """Whether a setting of this name is a credential, such as `password`, `client_secret` or `client-key-data`."""
+    """Whether a setting of this name is a credential, such as `password` or `client-key-data`."""
     return bool(_SECRET_NAME.search(name))
 
 
