@@ -130,6 +130,7 @@ Classes = Annotated[
         help="Meaning of the cloud's class codes, such as 65=noise,200=5 (docs/reference/formats.md).",
     ),
 ]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Link = Annotated[bool, typer.Option("--link", help="Link the input files into the tile instead of copying them.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing tile.")]
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -78,6 +80,22 @@ def progress(title: str) -> Iterator[Report]:
 def warn(text: str) -> None:
     """Show a warning."""
     console.print(f"[yellow]warning:[/] {escape(printable(text))}", highlight=False, soft_wrap=True)
+
+
+def print_json(value: Any) -> None:
+    """Print a result for other programs to standard output."""
+    print(json.dumps(value, indent=1, allow_nan=False))
+
+
+@contextmanager
+def messages_on_stderr(active: bool) -> Iterator[None]:
+    """If active, messages and progress go to standard error, so that standard output is the JSON only."""
+    before = console.stderr
+    console.stderr = before or active
+    try:
+        yield
+    finally:
+        console.stderr = before
 
 
 class RunDisplay:
