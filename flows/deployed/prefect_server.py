@@ -76,7 +76,7 @@ def _temporary_server() -> Iterator[None]:
 
 
 def bypass_proxy(host: str) -> None:
-    """Let this process and its children reach a host without the proxy that `HTTP_PROXY` may name."""
+    """Let this process and its children reach a host without the proxy that the environment may name."""
     for name in ("NO_PROXY", "no_proxy"):
         os.environ[name] = ",".join(filter(None, (os.environ.get(name), host)))
 

@@ -79,13 +79,14 @@ def _environment_of_server() -> Iterator[None]:
         "PYTHONPATH": os.pathsep.join([*folders, str(PACKAGES)]),
         "PYTHONSAFEPATH": "1",
     }
-    before, filters = {name: os.environ.get(name) for name in variables}, sys.warnoptions[:]
+    before, filters, path = {name: os.environ.get(name) for name in variables}, sys.warnoptions[:], sys.path[:]
     os.environ.update(variables)
     sys.warnoptions.append(TRACKER_WARNING_FILTER)
+    sys.path[:] = folders  # the server can't read what is no text, such as a `Path`
     try:
         yield
     finally:
-        sys.warnoptions[:] = filters
+        sys.warnoptions[:], sys.path[:] = filters, path
         for name, value in before.items():
             if value is None:
                 del os.environ[name]

@@ -113,7 +113,7 @@ class Digests:
     """`digest`, cached in a file for sources whose size, times and inode are unchanged.
 
     A kilometre of survey is gigabytes: detecting changes must not read all of it again. The time of the last change of
-    the status counts as well: programs can set the modification time, as `cp -p` and `rsync` do.
+    the status counts as well: programs can set the modification time, as "cp -p" and rsync do.
 
     Args:
         file: where the digests are cached.

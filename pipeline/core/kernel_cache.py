@@ -40,9 +40,9 @@ def run_without_space() -> None:
 
     def save_if_possible(self: Any, signature: Any, data: Any) -> None:
         with suppress(OSError):
-            save(self, signature, data)
+            save(self, signature, data)  # type: ignore[no-untyped-call]
 
-    Cache.save_overload = save_if_possible
+    Cache.save_overload = save_if_possible  # type: ignore[method-assign]
 
 
 def _users(environment: MutableMapping[str, str]) -> Path:

@@ -133,7 +133,7 @@ def test_digests_notice_a_file_that_was_overwritten_with_its_old_time(tmp_path: 
 def test_digests_of_files_that_may_still_be_written_are_not_kept(tmp_path: Path, source: Path) -> None:
     written = source.stat().st_ctime_ns
     for age, kept in ((10**9, 0), (10**10, 1)):
-        digests = Digests(tmp_path / "digests.json", clock=lambda age=age: written + age)
+        digests = Digests(tmp_path / "digests.json", clock=partial(int, written + age))
         assert digests(source) == digest(source)
         digests.save()
         assert len(json.loads((tmp_path / "digests.json").read_text(encoding="utf-8"))) == kept

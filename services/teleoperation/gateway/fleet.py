@@ -154,7 +154,7 @@ class Fleet:
         """Unregister a party's connection; its pair stays."""
         with self._lock:
             party = self._parties.get((peer.role, peer.name))
-            if party is not None and party.send is send:
+            if party is not None and party.send == send:
                 party.send, party.since, party.status, party.driver_since = None, self._now(), Status(), None
 
     # changes of pairs
