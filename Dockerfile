@@ -6,13 +6,15 @@ RUN apt-get update \
     && xargs -a /tmp/packages.txt apt-get install -y --no-install-recommends \
     && rm -rf /var/lib/apt/lists/* \
     && useradd --create-home --uid 1000 scan2sim \
-    && install -d -o scan2sim -g scan2sim /data
+    && install -d -o scan2sim -g scan2sim /data /home/scan2sim/.cache
 ENV PATH=/opt/venv/bin:$PATH PYTHONUNBUFFERED=1 DO_NOT_TRACK=1
 WORKDIR /app
 
 FROM system AS code
 RUN python -m venv /opt/venv
 COPY . .
+# a checkout with umask 077 can be read by its owner only
+RUN chmod -R a+rX .
 
 # without torch, which installs gigabytes of CUDA: reconstruction, videos and surveys don't need it
 FROM code AS cpu-environment

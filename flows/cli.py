@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import io
 import os
 import re
 import sys
@@ -15,13 +14,15 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from scan2sim import __version__
-from scan2sim.flows.commands import unchanged
+from scan2sim.flows.commands import process, unchanged
 from scan2sim.pipeline.core.errors import (
     INTERRUPTED,
     IncompleteError,
     ScanError,
     exit_code,
+    from_name_error,
     from_os_error,
+    is_about_a_file_name,
 )
 
 PAGES = Path(__file__).parents[1] / "docs"
@@ -142,21 +143,17 @@ def _run_survey_with_prefect(*arguments: Any) -> None:
         raise IncompleteError(report.parent / "world", state.message or "")
 
 
-def replace_unencodable_characters() -> None:
-    """Print `?` for characters that the terminal's encoding (such as Latin-1) doesn't have, instead of failing."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
-
-
 def main() -> None:
     """Run the command; each error becomes a message and an exit code (`pipeline.core.errors.EXIT_CODES`)."""
     os.environ.setdefault(
         "PYTHONSAFEPATH", "1"
     )  # or a random.py in the current folder would shadow the standard library in subprocesses
-    replace_unencodable_characters()
+    process.open_standard_streams()
+    process.replace_unencodable_characters()
+    process.raise_file_limit()
     unchanged.arguments = sys.argv[1:]
     try:
+        process.check_current_folder()
         began = time.perf_counter()
         lines = unchanged.unchanged(sys.argv[1:])
         if lines is None:
@@ -170,6 +167,8 @@ def main() -> None:
     except Exception as error:
         if isinstance(error, OSError):
             error = from_os_error(error, error.filename or "a file")
+        elif isinstance(error, UnicodeEncodeError) and is_about_a_file_name(error):
+            error = from_name_error(error)
 
         if isinstance(error, ScanError):
             level, colour = ("warning", "yellow") if isinstance(error, IncompleteError) else ("error", "red")

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from scan2sim.pipeline.core.cores import available_cores
 from scan2sim.pipeline.core.errors import InputError, SettingError
 
 FLOATS = {"tensor(float)": "float32", "tensor(float16)": "float16"}
@@ -100,4 +101,4 @@ def _threads() -> int:
     count = os.environ.get("OMP_NUM_THREADS", "")
     if count.isdecimal() and int(count):
         return int(count)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return available_cores()

@@ -1,8 +1,13 @@
-"""Redacts credentials in URLs before a URL is displayed, logged, published or written."""
+"""Redacts credentials before a text is displayed, logged, published or written.
+
+Those in URLs are found by their place (`redacted`), others by the request that contained them (`secrets_of`).
+"""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 HIDDEN = "***"
 _USERINFO = re.compile(
@@ -16,6 +21,9 @@ _PARAMETER = re.compile(
     r"([?&;][\w.-]*(?:pass(?:word|wd|phrase)?|pwd?|pas|token|secret|key|auth|sig(?:nature)?|credentials?|session)=)[^\s&]+",
     re.IGNORECASE,
 )
+_SECRET_NAME = re.compile(r"pass(?:word|wd|phrase)?$|secret|token|credential|key(?:[-_]data)?$", re.IGNORECASE)
+MIN_SECRET_CHARS = 4
+"""Shorter texts aren't redacted: they would be found in any message."""
 
 
 def redacted(text: str) -> str:
@@ -25,3 +33,28 @@ def redacted(text: str) -> str:
     of a credential: `?password=`, `&access_token=`, `&X-Amz-Signature=`. Redaction is idempotent.
     """
     return _PARAMETER.sub(rf"\1{HIDDEN}", _USERINFO.sub(rf"\1{HIDDEN}@", text))
+
+
+def is_secret(name: str) -> bool:
+    """Whether a setting of this name is a credential, such as `password` or `client-key-data`."""
+    return bool(_SECRET_NAME.search(name))
+
+
+def secrets_of(body: Any, name: str = "") -> Iterator[str]:
+    """Credentials in a request's body: texts at any depth whose name is that of a credential."""
+    if isinstance(body, Mapping):
+        for key, value in body.items():
+            yield from secrets_of(value, str(key))
+    elif isinstance(body, list | tuple):
+        for value in body:
+            yield from secrets_of(value, name)
+    elif isinstance(body, str) and len(body) >= MIN_SECRET_CHARS and is_secret(name):
+        yield body
+
+
+def without(text: str, secrets: Iterable[str]) -> str:
+    """Replace credentials in a text by `***`, also where it quotes them as Python does."""
+    for secret in sorted(set(secrets), key=len, reverse=True):
+        for form in (secret, repr(secret)[1:-1]):
+            text = text.replace(form, HIDDEN)
+    return text

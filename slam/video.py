@@ -14,6 +14,7 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8
+from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images.image import SUFFIXES, read_levels
 
 
@@ -97,7 +98,7 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
         raise InputError(path, "file not found", "Check the path; give a video file, or a folder of images")
     av = _av()
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path.absolute())) as container:  # FFmpeg takes `12:30.mp4` for an address
             if not container.streams.video or container.streams.video[0].codec_context is None:
                 raise InputError(path, "has no readable video stream", "Give a video file, or a folder of images")
             stream = container.streams.video[0]
@@ -139,7 +140,8 @@ def _natural(path: Path) -> list[Any]:
 
 
 def _files(path: Path) -> list[Path]:
-    return sorted((p for p in path.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
+    found = (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and not file_checks.hidden(p))
+    return sorted(found, key=_natural)
 
 
 def _folder(path: Path, fps: float, times: Path | None) -> Video:
@@ -168,7 +170,7 @@ def _of_folder(video: Video) -> Iterator[Frame]:
 
 def _of_file(video: Video, warn: Callable[[str], None]) -> Iterator[Frame]:
     av = _av()
-    with av.open(str(video.path)) as container:
+    with av.open(str(video.path.absolute())) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         first: float | None = None

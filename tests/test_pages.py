@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import shlex
 import subprocess
@@ -16,6 +17,7 @@ import pytest
 import typer
 from pydantic import BaseModel, ValidationError
 
+import scan2sim
 from scan2sim.flows.cli import COMMANDS, app, loaded
 from scan2sim.flows.pipelines.drive import Drive
 from scan2sim.flows.pipelines.steps import STEPS
@@ -242,3 +244,24 @@ def test_the_page_of_inputs_lists_every_import() -> None:
     text = (ROOT / "docs/inputs.md").read_text(encoding="utf-8")
     imports = {word for word, command in loaded("import").commands.items() if not command.hidden}
     assert set(re.findall(r"scan2sim import ([\w-]+)", text)) == imports
+
+
+def test_the_page_of_python_describes_every_function() -> None:
+    text = (ROOT / "docs/reference/python.md").read_text(encoding="utf-8")
+    (members,) = re.findall(r"members: \[(.*)\]", text)
+    names = {name for name in scan2sim.__all__ if not name.endswith("Error") and name != "__version__"}
+    assert set(members.split(", ")) == names
+    imports = {name for name in names if name.startswith("import_")}
+    assert set(re.findall(r"`(import_\w+)`", text)) == imports
+
+
+@pytest.mark.parametrize("page", page_params([page for page in PAGES if "```python" in text_of(page)]))
+def test_python_on_the_pages_imports_existing_names(page: Path) -> None:
+    for block in re.findall(r"```python\n(.*?)```", text_of(page), re.DOTALL):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("scan2sim"):
+                module = importlib.import_module(str(node.module))
+                missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
+                assert not missing, f"{node.module} has no {missing}"
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "scan2sim":
+                assert node.attr in scan2sim.__all__, f"scan2sim has no public name {node.attr}"

@@ -6,7 +6,6 @@ Both are native code that can hang or crash, so `texturing.unwrap` calls them in
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -23,6 +22,10 @@ MAX_CHART_TEXELS = 30_000
 """Largest area of xatlas' charts: growing a chart takes time quadratic in its faces."""
 CHART_LIMIT_TEXEL_M = 0.01
 """Texel size in metres above which charts don't get larger, for the same reason."""
+
+_kept: list[Any] = []
+"""Atlases of xatlas, which are never freed: that can wait forever for a thread of xatlas that goes to sleep just when
+it is woken up to end. A child process makes one only, and ends without freeing it."""
 
 
 @dataclass(frozen=True)
@@ -43,18 +46,13 @@ class Unwrapped:
     backend: Backend
 
 
-def unwrap_blocks(
-    backend: Backend, blocks: Sequence[tuple[F32, I32]], texel: float, gutter: int
-) -> list[Unwrapped | str]:
-    """Unwrap blocks (vertices (V, 3) in metres, faces (F, 3)), one page each; the reason for blocks that fail."""
-    backends = {"uvatlas": _uvatlas, "xatlas": _xatlas}
-    out: list[Unwrapped | str] = []
-    for vertices, faces in blocks:
-        try:
-            out.append(backends[backend](vertices, faces, texel, gutter))
-        except RuntimeError as error:
-            out.append(str(error).strip().splitlines()[-1])
-    return out
+def unwrap_block(backend: Backend, vertices: F32, faces: I32, texel: float, gutter: int) -> Unwrapped:
+    """Unwrap a block (vertices (V, 3) in metres, faces (F, 3)) onto one page.
+
+    Raises:
+        RuntimeError: the backend can't.
+    """
+    return {"uvatlas": _uvatlas, "xatlas": _xatlas}[backend](vertices, faces, texel, gutter)
 
 
 def manifold(faces: I32) -> tuple[I32, I32]:
@@ -144,6 +142,7 @@ def _xatlas(vertices: F32, faces: I32, texel: float, gutter: int) -> Unwrapped:
     import xatlas
 
     atlas = xatlas.Atlas()
+    _kept.append(atlas)
     atlas.add_mesh(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.uint32))
     chart, pack = xatlas.ChartOptions(), xatlas.PackOptions()
     chart.max_chart_area = MAX_CHART_TEXELS * min(texel, CHART_LIMIT_TEXEL_M) ** 2

@@ -8,14 +8,14 @@ unwrapped by the other.
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from scan2sim.pipeline.core.cores import available_cores
 from scan2sim.pipeline.core.errors import SettingError, StepError
 from scan2sim.pipeline.core.parameters import Seconds, Texel
 from scan2sim.pipeline.core.step import Params, Report
@@ -190,55 +190,43 @@ def halves(mesh: Mesh, block: Index) -> list[Index]:
 
 
 def _unwrap_all(mesh: Mesh, blocks: list[Index], params: UnwrapParams) -> list[Unwrapped]:
-    """Unwrap blocks with one child process per core; failed blocks are retried alone, then by the other backend."""
+    """Unwrap blocks, each in a child process, one per core at a time; those that fail by the other backend."""
     from concurrent.futures import ThreadPoolExecutor
 
-    workers = max(1, min(os.cpu_count() or 1, len(blocks)))
-    by_size = sorted(range(len(blocks)), key=lambda i: -len(blocks[i]))
-    shares = [by_size[k::workers] for k in range(workers)]
     own, other = backend_of(params), fallback_of(params)
-    with ThreadPoolExecutor(workers) as pool:
-        first = pool.map(lambda share: _unwrap_in_child(mesh, [blocks[i] for i in share], own, params), shares)
-        results: dict[int, Any] = {
-            i: one for share, flat in zip(shares, first, strict=True) for i, one in zip(share, flat, strict=True)
-        }
-        for backend in (own, other):
-            failed = [i for i, flat in results.items() if isinstance(flat, str)]
-            if backend == own:  # a crash fails all blocks of the child process: retry each block alone
-                failed = [i for i in failed if results[i].startswith(CHILD_ERROR) and len(blocks) > workers]
-            retried = pool.map(lambda i, b=backend: _unwrap_in_child(mesh, [blocks[i]], b, params)[0], failed)
-            results.update(zip(failed, retried, strict=True))
-    for i, flat in results.items():
-        if isinstance(flat, str):
-            raise StepError(
-                "unwrap", f"neither UVAtlas nor xatlas can unwrap a block of {len(blocks[i])} faces ({flat})",
-                "Set a smaller `unwrap.block_faces`, or decimate the mesh further",
-            )  # fmt: skip
+    by_size = sorted(range(len(blocks)), key=lambda i: -len(blocks[i]))
+    results: dict[int, Unwrapped] = {}
+    failed: dict[int, str] = {}
+    with ThreadPoolExecutor(max(1, min(available_cores(), len(blocks)))) as pool:
+        for i, flat in zip(by_size, pool.map(lambda i: _in_child(mesh, blocks[i], own, params), by_size), strict=True):
+            if isinstance(flat, str):
+                failed[i] = flat
+            else:
+                results[i] = flat
+        retried = pool.map(lambda i: _in_child(mesh, blocks[i], other, params), failed)
+        for (i, reason), flat in zip(failed.items(), retried, strict=True):
+            if isinstance(flat, str):
+                raise StepError(
+                    "unwrap",
+                    f"neither {own} ({reason}) nor {other} ({flat}) can unwrap a block of {len(blocks[i])} faces",
+                    "Set a smaller `unwrap.block_faces`, or decimate the mesh further",
+                )
+            results[i] = flat
     return [results[i] for i in range(len(blocks))]
 
 
-CHILD_ERROR = "child process: "
-"""Prefix of the reasons for blocks whose child process failed."""
-
-
-def _unwrap_in_child(mesh: Mesh, blocks: list[Index], backend: Backend, params: UnwrapParams) -> list[Unwrapped | str]:
-    """Unwrap blocks in one child process; for failed blocks, the reason."""
+def _in_child(mesh: Mesh, block: Index, backend: Backend, params: UnwrapParams) -> Unwrapped | str:
+    """Unwrap a block in a child process; the reason if it fails."""
     from scan2sim.pipeline.core import sandbox
 
-    parts = []
-    for block in blocks:
-        used, faces = np.unique(mesh.faces[block], return_inverse=True)
-        parts.append((mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32)))
-    timeout = params.timeout * sum(max(1.0, len(block) / 10_000) for block in blocks)
+    used, faces = np.unique(mesh.faces[block], return_inverse=True)
+    part = mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32)
+    timeout = params.timeout * max(1.0, len(block) / 10_000)
+    target = "scan2sim.texturing.atlas:unwrap_block"
     try:
-        return sandbox.call(
-            "scan2sim.texturing.atlas:unwrap_blocks",
-            backend,
-            parts,
-            params.texel,
-            params.gutter,
-            timeout=timeout,
-            threads=1,
+        unwrapped: Unwrapped = sandbox.call(
+            target, backend, *part, params.texel, params.gutter, timeout=timeout, threads=1
         )
     except StepError as error:
-        return [CHILD_ERROR + error.cause] * len(blocks)
+        return error.cause
+    return unwrapped

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+from zipfile import BadZipFile
 
 import numpy as np
+import numpy.typing as npt
 
 from scan2sim.pipeline.camera.renderer import SKY_RGB, Body, Image, Renderer, placed
 from scan2sim.pipeline.core.classes import CODE, CODE_OF_SURFACE
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.splats import XYZ, SplatLayer, Splats
-from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, Colour
+from scan2sim.pipeline.core.types import F32, F64, I32, U8, Bools, Camera, CameraModel, Colour
 from scan2sim.pipeline.io.worlds.instances import Instance, TileInstances, box_ids, instances_of
-from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile
+from scan2sim.pipeline.io.worlds.scene import BACKDROP, EXPORT_AGAIN, Scene, SceneTile
 from scan2sim.texturing.splats.background import Background
 from scan2sim.texturing.splats.view import SplatRenderer
 
@@ -81,7 +88,13 @@ class WorldCamera:
             T_world_cam: (4, 4) pose in world metres; camera axes x right, y down, z ahead.
             camera: any perspective model.
             samples: rays per pixel along each axis, of surfaces.
+
+        Raises:
+            SettingError: `T_world_cam` is no pose, or the camera has no focal length or an unknown model.
+            InputError: the surfaces or the splats of a tile are missing or damaged.
         """
+        T_world_cam = _pose(T_world_cam)
+        _check_lens(camera)
         self._load(T_world_cam[:3, 3])
         seen = self._surfaces.view(camera, T_world_cam, samples=samples if self._surfaces.are_shown else 1)
         code, instance = self._surfaces.codes(seen), self._surfaces.instances(seen)
@@ -108,6 +121,8 @@ class WorldCamera:
 
     def colours(self, T_world_cam: F64, camera: Camera, *, samples: int = 2) -> U8:
         """Colours (H, W, 3) of a view, as `render` gives them; faster where all tiles have splats."""
+        T_world_cam = _pose(T_world_cam)
+        _check_lens(camera)
         self._load(T_world_cam[:3, 3])
         if self._splats is None or self._surfaces.are_shown:
             return self.render(T_world_cam, camera, samples=samples).rgb
@@ -137,6 +152,7 @@ class WorldCamera:
         order, distance = self._layout.by_distance(position)
         near = sorted(order[: max(1, int(np.count_nonzero(distance <= self._farthest)))])
         if near != self._near:
+            self._near = []  # if a file of a tile can't be read, the next view prepares its tiles again
             self._layers = {k: self._layers[k] if k in self._layers else _placed(self._scene.tiles[k]) for k in near}
             tiles, shown = [self._scene.tiles[k] for k in near], [self._layers[k] is None for k in near]
             bodies = [_bodies(tile) for tile in tiles]
@@ -157,6 +173,34 @@ class WorldCamera:
             self._splats.behind = (
                 [(Background(BLACK), 1.0)] if black else [(self._backgrounds[k], share) for k, share in shares.items()]
             )
+
+
+def _pose(T_world_cam: npt.ArrayLike) -> F64:
+    """The pose (4, 4) as an array.
+
+    Raises:
+        SettingError: it has another shape, or contains NaN or infinity.
+    """
+    T = np.asarray(T_world_cam, np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        cause = f"is no pose: shape {T.shape}" + ("" if T.shape != (4, 4) else ", with NaN or infinity")
+        raise SettingError("T_world_cam", cause, "Give a finite matrix (4, 4), camera to world")
+    return T
+
+
+def _check_lens(camera: Camera) -> None:
+    """Reject a camera that sees nothing.
+
+    Raises:
+        SettingError: its model is unknown, or it has no focal length or no pixels.
+    """
+    models = get_args(CameraModel)
+    if camera.model not in models:
+        raise SettingError("camera", f"has the unknown model {camera.model!r}", f"Use {', '.join(models)}")
+    if min(camera.width, camera.height) < 1:
+        raise SettingError("camera", f"has {camera.width} x {camera.height} pixels", "Give its size in pixels")
+    if camera.model != "equirectangular" and not min(camera.fx, camera.fy) > 0:
+        raise SettingError("camera", "has no focal length", "Give fx and fy in pixels, and cx and cy")
 
 
 @dataclass(frozen=True)
@@ -196,10 +240,24 @@ _Bodies = dict[str, tuple[Body, U8]]
 """Textured surfaces of a tile in world metres, and the LAS codes of their faces, by group."""
 
 
+@contextmanager
+def _readable(folder: Path) -> Iterator[None]:
+    """Convert the errors of a file in a folder of the world that is missing or damaged.
+
+    Raises:
+        InputError: names the folder.
+    """
+    try:
+        yield
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(folder, f"can't be read ({error})", EXPORT_AGAIN) from error
+
+
 def _bodies(tile: SceneTile) -> _Bodies:
     found: _Bodies = {}
     for group in tile.groups:
-        body = placed(tile.folder / group, tile.offset)
+        with _readable(tile.folder / group):
+            body = placed(tile.folder / group, tile.offset)
         own, codes = tile.codes.get(group, CODE_OF_SURFACE[group]), body.mesh.classification
         whole = np.full(len(body.mesh), own, np.uint8)
         found[group] = body, whole if codes is None else np.where(codes == 0, whole, codes)
@@ -256,7 +314,8 @@ def _backdrops(tiles: list[SceneTile], sky: Colour | None) -> Renderer | None:
 
 def _placed(tile: SceneTile) -> SplatLayer | None:
     """The splats of a tile in world metres; None: it has none."""
-    layer = tile.splats()
+    with _readable(tile.folder):
+        layer = tile.splats()
     if layer is None:
         return None
     layer.splats.parameters[:, XYZ] += np.asarray(tile.offset, np.float32)

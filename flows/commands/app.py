@@ -67,6 +67,11 @@ class App(typer.Typer):
         return super().command(name, cls=command_class, **options)
 
 
+def _named(out: Path) -> Path:
+    """A folder by its name, for `.` and `..`: tiles are named after their folders."""
+    return out if out.name not in ("", "..") else out.resolve()
+
+
 TilePath = Annotated[
     Path,
     typer.Argument(
@@ -111,7 +116,7 @@ Name = Annotated[
     str | None,
     typer.Option("--name", help="Name of the tile: letters, digits, underscores; default: from the folder's name."),
 ]
-TileOut = Annotated[Path, typer.Option("--out", "-o", help="Folder of the tile to create.")]
+TileOut = Annotated[Path, typer.Option("--out", "-o", callback=_named, help="Folder of the tile to create.")]
 Crs = Annotated[
     str | None,
     typer.Option(
@@ -125,6 +130,7 @@ Classes = Annotated[
         help="Meaning of the cloud's class codes, such as 65=noise,200=5 (docs/reference/formats.md).",
     ),
 ]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Link = Annotated[bool, typer.Option("--link", help="Link the input files into the tile instead of copying them.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing tile.")]
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 import time
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from contextvars import ContextVar
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -19,7 +21,33 @@ from scan2sim.flows.pipelines.graph import Task
 from scan2sim.pipeline.core.errors import printable
 from scan2sim.pipeline.core.step import Report
 
-console = Console()
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+
+
+class _Console(Console):
+    """A console that may be quiet for a single run, while others in the same process print in their own threads."""
+
+    @property
+    def quiet(self) -> bool:
+        """Whether the running thread prints nothing."""
+        return _quiet.get()
+
+    @quiet.setter
+    def quiet(self, value: bool) -> None:
+        _quiet.set(value)
+
+
+console = _Console()
+
+
+@contextmanager
+def shown(progress: bool) -> Iterator[None]:
+    """Print what happens in the context, or nothing; other threads print as they do."""
+    before, console.quiet = console.quiet, not progress
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def _progress() -> Progress:
@@ -33,7 +61,7 @@ def _progress() -> Progress:
         expand=True,
         console=console,
         transient=True,
-        disable=not console.is_terminal,
+        disable=console.quiet or not console.is_terminal,  # its thread would print, too
     )
 
 
@@ -52,6 +80,22 @@ def progress(title: str) -> Iterator[Report]:
 def warn(text: str) -> None:
     """Show a warning."""
     console.print(f"[yellow]warning:[/] {escape(printable(text))}", highlight=False, soft_wrap=True)
+
+
+def print_json(value: Any) -> None:
+    """Print a result for other programs to standard output."""
+    print(json.dumps(value, indent=1, allow_nan=False))
+
+
+@contextmanager
+def messages_on_stderr(active: bool) -> Iterator[None]:
+    """If active, messages and progress go to standard error, so that standard output is the JSON only."""
+    before = console.stderr
+    console.stderr = before or active
+    try:
+        yield
+    finally:
+        console.stderr = before
 
 
 class RunDisplay:
@@ -102,8 +146,15 @@ class RunDisplay:
                 console.print(f"{mark} {task.full_name:<22}[dim]{seconds:7.1f} s  {self._done}/{self._task_count}")
 
 
-def log_unexpected(error: BaseException) -> Path:
-    """Write the traceback of an unexpected error to a temporary file; returns its path."""
-    with tempfile.NamedTemporaryFile("w", prefix="scan2sim-error-", suffix=".log", delete=False) as file:
-        file.write("".join(traceback.format_exception(error)))
-    return Path(file.name)
+def log_unexpected(error: BaseException) -> str:
+    """Write the traceback of an unexpected error to a temporary file, or print it; returns where it is."""
+    try:
+        file = tempfile.NamedTemporaryFile(
+            "w", prefix="scan2sim-error-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        )
+        with file:
+            file.write("".join(traceback.format_exception(error)))
+    except OSError:  # no folder for temporary files, or no space in it
+        traceback.print_exception(error)
+        return "the traceback above"
+    return file.name

@@ -113,8 +113,13 @@ def plan_drive(
 
 
 def _link(folder: Path, place: Path) -> None:
-    """Create or update the symbolic link `place` to a result."""
+    """Create or update the symbolic link `place` to a result; without links, `place.txt` has the result's path."""
     if place.is_symlink():
         place.unlink()
-    if not place.exists():
-        place.symlink_to(os.path.relpath(folder, place.parent), target_is_directory=True)
+    if place.exists():
+        return
+    path = os.path.relpath(folder, place.parent)
+    try:
+        place.symlink_to(path, target_is_directory=True)
+    except OSError:  # exFAT, many network drives
+        place.with_name(f"{place.name}.txt").write_text(f"{path}\n", encoding="utf-8")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -26,9 +26,9 @@ app = App()
 
 
 @contextmanager
-def _simplified(scene: Scene, limits: Budget, levels: int, report: Report) -> Iterator[Scene]:
-    """The scene reduced to a budget, with levels of detail; its files are temporary, deleted with the context."""
-    with tempfile.TemporaryDirectory() as work:
+def _simplified(scene: Scene, limits: Budget, levels: int, folder: Path, report: Report) -> Iterator[Scene]:
+    """The scene reduced to a budget, with levels of detail; its files in `folder` are deleted with the context."""
+    with tempfile.TemporaryDirectory(prefix=".simplified-", dir=folder) as work:
         if limits != Budget():
             from scan2sim.texturing.simplify_textured import simplified_scene
 
@@ -83,7 +83,27 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing export.")] = False,
 ) -> None:
     """Convert a finished world to other formats, for other simulators."""
-    formats = list(dict.fromkeys(filter(None, map(str.strip, to.split(",")))))
+    export_world(world, to, out, params, budget=budget, levels=levels, robot=robot, overwrite=overwrite)
+
+
+def export_world(
+    world: Path,
+    to: str | Sequence[str],
+    out: Path,
+    params: SceneParams,
+    *,
+    budget: str | None = None,
+    levels: int | None = None,
+    robot: bool = False,
+    overwrite: bool = False,
+) -> Path:
+    """Convert the world in a folder to formats, a list or a text with commas; returns `out`.
+
+    Raises:
+        ScanError: unknown format, a missing package, no world, or `out` is not empty.
+    """
+    words = to.split(",") if isinstance(to, str) else to
+    formats = list(dict.fromkeys(filter(None, map(str.strip, words))))
     if not formats:
         raise SettingError("--to", "names no format", f"Choose from: {', '.join(world_formats.format_names())}")
     world_formats.check(formats, params, "--to", robot)
@@ -92,10 +112,11 @@ def export(
     with (
         progress("export") as report,
         tile_folder(out, overwrite, "world") as folder,
-        _simplified(scene, limits, levels or world_formats.levels(formats), report) as small,
+        _simplified(scene, limits, levels or world_formats.levels(formats), folder, report) as small,
     ):
         world_formats.write(small, formats, folder, params, report, robot)
         _warn_of_exceeded_budget(small, limits)
     if scene.frame.crs == LOCAL:
         warn(f"{scene.name} has no CRS: the export is not georeferenced")
     console.print(f"World:  {out}", highlight=False, soft_wrap=True)
+    return out

@@ -10,21 +10,21 @@ import typer
 
 from scan2sim.flows.commands.app import App, Classes, Crs, Link, Name, Overwrite, TileOut
 from scan2sim.flows.commands.display import progress
+from scan2sim.flows.commands.imported import all_warnings, summaries
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.robot_map import NoImages, map_params
 from scan2sim.flows.commands.sweeps import cached_check, run_before_import
 from scan2sim.flows.pipelines import assembled, bag, dataset, images, kitti, sweeps
 from scan2sim.flows.pipelines.graph import Task
 from scan2sim.pipeline.core.classes import parse_mapping
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.importers.mesh_model import import_mesh
 from scan2sim.pipeline.importers.photogrammetry import import_model
 from scan2sim.pipeline.importers.robot_map import MapParams, import_map, map_files
-from scan2sim.pipeline.io import trajectory_check
 from scan2sim.pipeline.io.mesh_files import find_mesh
 from scan2sim.pipeline.io.tile_folder import check_target
-from scan2sim.pipeline.plausibility.check import check_tile
-from scan2sim.pipeline.pose_check.check import check_photos, read_check
+from scan2sim.pipeline.pose_check.check import check_photos
 from scan2sim.pipeline.pose_check.conventions import PhotoConventions
 from scan2sim.pipeline.steps import import_photos
 from scan2sim.pipeline.steps.import_sweeps import SweepsParams, build_tile
@@ -359,6 +359,8 @@ def import_unposed_photos(
 ) -> None:
     """Photos without poses, or a video: poses by COLMAP, scale and position by GPS and a cloud (docs/images.md)."""
     check_target(out, overwrite)
+    if out.resolve().is_relative_to(source.photos.resolve()):
+        raise SettingError("--out", f"is inside the folder of the photos, {source.photos}", "Choose a folder beside it")
     tasks = images.build_graph(source, Path())
     inputs = run_before_import(tasks, out.with_name(f"{out.name}-photos"))
     params, warnings = tasks[-1].params, list[str]()
@@ -383,13 +385,7 @@ def _import_sweeps(tasks: list[Task], out: Path, suffix: str, **options: Any) ->
 
 
 def _print_imported(path: Path, warnings: Sequence[str] = ()) -> None:
-    for warning in dict.fromkeys((*warnings, *check_tile(path))):
+    for warning in all_warnings(path, warnings):
         typer.secho(f"warning: {warning}", fg="yellow", err=True)
-    check = trajectory_check.read(path.parent)
-    if check is not None:
-        summary = str(check.get("summary"))
-        typer.echo(summary[:1].upper() + summary[1:])
-    photos = read_check(path.parent)
-    if photos is not None:
-        typer.echo(f"Photos: {photos.get('summary')}")
-    typer.echo(f"Tile: {path}")
+    for line in (*summaries(path), f"Tile: {path}"):
+        typer.echo(line)

@@ -20,7 +20,7 @@ class Log:
 
     def write(self, *lines: str) -> None:
         """Append lines; the first one gets a timestamp."""
-        with open(self.path, "a", encoding="utf-8") as file:
+        with open(self.path, "a", encoding="utf-8", errors="backslashreplace") as file:  # paths may not be UTF-8
             now = datetime.now().isoformat(" ", "milliseconds")
             file.write(f"{now} " + "".join(f"{line.rstrip()}\n" for line in lines))
 

@@ -44,3 +44,12 @@ def check(given: Mapping[str, Any]) -> None:
         if name in NumericOptions.model_fields and isinstance(value, (int, float, tuple)):
             option = f"--{name.replace('_', '-')}"
             NumericOptions.of("", {name: value}, remedy=f"Change {option}; `--help` describes it")
+
+
+def check_arguments(function: str, **numbers: float | None) -> None:
+    """Check numbers that are given to a function of the Python API, by the ranges of the options of these names.
+
+    Raises:
+        SettingError: naming the function, the argument and its range.
+    """
+    NumericOptions.of(function, numbers, remedy="docs/reference/python.md describes it")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,8 +11,8 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console, warn
+from scan2sim.flows.commands.app import App, Json
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, warn
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, progress_lines, say
 from scan2sim.flows.commands.orchestrate_sites import cluster as cluster_commands
@@ -91,23 +92,37 @@ def orchestrate_package(
 
 @app.command("list")
 @options(Connection)
-def orchestrate_list(params: Connection) -> None:
+def orchestrate_list(params: Connection, as_json: Json = False) -> None:
     """List the packages and instances in OSM."""
     from scan2sim.services.orchestration.osm import FUNCTIONS, SERVICES
 
-    with osm_client(params) as osm:
-        packages = Table("package", "kind", "state", title="Packages", title_justify="left")
-        for kind, collection in (("function", FUNCTIONS), ("network service", SERVICES)):
-            for one in osm.packages(collection):
-                packages.add_row(escape(one.name), kind, escape(one.admin.onboarding_state.lower()))
-        instances = Table(
-            "instance", "network service", "state", "description", title="Instances", title_justify="left"
-        )
-        for found in osm.instances():
-            facts = (found.name, found.descriptor, found.state.lower().replace("_", " "), found.description)
-            instances.add_row(*map(escape, facts))
-    console.print(packages)
-    console.print(instances)
+    kinds = (("function", FUNCTIONS), ("network service", SERVICES))
+    with messages_on_stderr(as_json), osm_client(params) as osm:
+        packages = [
+            {"name": one.name, "kind": kind, "state": one.admin.onboarding_state.lower()}
+            for kind, collection in kinds
+            for one in osm.packages(collection)
+        ]
+        instances = [
+            {
+                "name": one.name,
+                "network service": one.descriptor,
+                "state": one.state.lower().replace("_", " "),
+                "description": one.description,
+            }
+            for one in osm.instances()
+        ]
+    if as_json:
+        print_json({"packages": packages, "instances": instances})
+        return
+    for title, names, found in (
+        ("Packages", ("name", "kind", "state"), packages),
+        ("Instances", ("name", "network service", "state", "description"), instances),
+    ):
+        table = Table(*names, title=title, title_justify="left")
+        for facts in found:
+            table.add_row(*(escape(facts[name]) for name in names))
+        console.print(table)
 
 
 @app.command("onboard")
@@ -246,21 +261,25 @@ def orchestrate_delete(
 
 @app.command("plan")
 @options(Connection)
-def orchestrate_plan(params: Connection, services: Services) -> None:
+def orchestrate_plan(params: Connection, services: Services, as_json: Json = False) -> None:
     """List what `apply` would do, and why."""
     from scan2sim.services.orchestration import apply, deployment
 
     requested = deployment.read(services)
-    with osm_client(params) as osm:
+    with messages_on_stderr(as_json), osm_client(params) as osm:
         changes = apply.plan(apply.load_state(osm, requested, services.parent))
+    if as_json:
+        print_json([asdict(one) for one in changes])
+        return
     console.print(_changes(changes)) if changes else say("nothing to do: all services are as described")
 
 
 @app.command("apply")
 @options(ApplyParams)
-def orchestrate_apply(params: ApplyParams, services: Services) -> None:
+def orchestrate_apply(params: ApplyParams, services: Services, as_json: Json = False) -> None:
     """Create, change and delete services until those in OSM are as described in the file (idempotent)."""
-    _apply(params, services)
+    with messages_on_stderr(as_json):
+        _apply(params, services, as_json=as_json)
 
 
 @app.command("place")
@@ -272,10 +291,14 @@ def orchestrate_place(
         list[Path],
         typer.Argument(metavar="MEASURED...", help="JSON files of `scan2sim qos measure --out`, one per site."),
     ],
+    as_json: Json = False,
 ) -> None:
     """List the sites that meet the requirements of a toolbox, by measurements, and why others don't."""
-    table = Table("site", "", "why not", title=f"Placement of {service}", title_justify="left")
     placements = placement.place(service, [placement.read(path) for path in measured])
+    if as_json:
+        print_json([asdict(one) for one in placements])
+        return
+    table = Table("site", "", "why not", title=f"Placement of {service}", title_justify="left")
     for one in placements:
         unknown = [f"not measured or decided: {', '.join(one.unknown)}"] if one.unknown else []
         why = escape("\n".join([*one.unmet, *unknown]))
@@ -310,7 +333,7 @@ def orchestrate_pool(params: AutoscaleParams) -> None:
     spin(create)
 
 
-def _apply(params: ApplyParams, path: Path, *, delete: bool = False) -> None:
+def _apply(params: ApplyParams, path: Path, *, delete: bool = False, as_json: bool = False) -> None:
     from scan2sim.services.orchestration import apply, deployment
 
     requested = deployment.read(path)
@@ -319,7 +342,7 @@ def _apply(params: ApplyParams, path: Path, *, delete: bool = False) -> None:
     stop, pacer = threading.Event(), apply.RequestPacer()
     with osm_client(params, pacer) as osm, progress_lines(requested.deployment) as report, stop_on_signal(stop):
         result = apply.apply(osm, apply.load_state(osm, requested, path.parent), params, report, stop, pacer)
-    _print_result(result)
+    _print_result(result, as_json)
     if stop.is_set():
         raise KeyboardInterrupt
     if (error := apply.failure(result)) is not None:
@@ -333,7 +356,11 @@ def _values(given: list[str]) -> dict[str, str]:
     return {name: value for name, _, value in pairs}
 
 
-def _print_result(result: ApplyResult) -> None:
+def _print_result(result: ApplyResult, as_json: bool) -> None:
+    if as_json:
+        failed = {name: _error_text(error, name) for name, error in result.failed.items()}
+        print_json({"done": [asdict(one) for one in result.done], "failed": failed})
+        return
     if not result.done and not result.failed:
         say("nothing to do: all services are as described")
         return

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
-from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console
-from scan2sim.flows.commands.options import options
+from scan2sim.flows.commands.app import App, Json
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json
+from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, say
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.services.credentials import redacted
 from scan2sim.services.orchestration.settings import Connection, OperationParams
+
+if TYPE_CHECKING:
+    from scan2sim.services.orchestration.records import SiteRecord
 
 REQUIREMENT = ("orchestration", "httpx", "yaml", "jsonschema")
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name in OSM.")]
@@ -37,15 +40,26 @@ def vim_add(
     kind: Annotated[
         str, typer.Option("--type", help="Type of the VIM: openstack, aws, azure, gcp, vmware, dummy, ...")
     ] = "openstack",
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="YAML or JSON file with settings of this type of VIM, such as security_groups, keypair, insecure or "
+            "project_domain_name of OpenStack; --set overrides it.",
+        ),
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="One of these settings; not for credentials; repeatable."),
+    ] = None,
 ) -> None:
     """Register a VIM account; `--type dummy` for a Kubernetes cluster without a VIM."""
     from scan2sim.services.orchestration import sites
 
-    try:
-        password = vim_password.read_text("utf-8").strip()
-    except (OSError, UnicodeError) as error:
-        raise InputError(vim_password, f"can't be read ({error})", "Give a text file that holds it") from None
-    body = sites.vim_request(name, url, kind=kind, user=vim_user, password=password, tenant=tenant)
+    body = sites.vim_request(
+        name, url, kind=kind, user=vim_user, password=sites.read_secret(vim_password), tenant=tenant,
+        config=sites.vim_config(config, assigned(set_ or (), "insecure=true")),
+    )  # fmt: skip
     _add(params, "vim", lambda _: body)
 
 
@@ -80,11 +94,19 @@ def repo_add(
     params: OperationParams,
     name: Name,
     url: Annotated[str, typer.Argument(metavar="URL", help="Address of the repository: https:// or oci://.")],
+    repo_user: Annotated[
+        str | None, typer.Option(help="User name at a private repository; default: it is public.")
+    ] = None,
+    repo_password: Annotated[
+        Path | None, typer.Option(help="File with the password or token at a private repository.")
+    ] = None,
 ) -> None:
     """Register a repository of Helm charts."""
     from scan2sim.services.orchestration import sites
 
-    _add(params, "repo", lambda _: sites.repository_request(name, url))
+    password = None if repo_password is None else sites.read_secret(repo_password)
+    body = sites.repository_request(name, url, user=repo_user, password=password)
+    _add(params, "repo", lambda _: body)
 
 
 def _add(params: OperationParams, which: str, body: Callable[[Any], dict[str, Any]]) -> None:
@@ -96,23 +118,35 @@ def _add(params: OperationParams, which: str, body: Callable[[Any], dict[str, An
     say(f"{made['name']} is {'added' if new else 'already in OSM, and unchanged'}")
 
 
+def _facts(one: SiteRecord) -> dict[str, str]:
+    return {
+        "name": one.name,
+        "id": one.record,
+        "kind": one.vim_type or one.type,
+        "address": redacted(one.vim_url or one.url),
+        "state": one.admin.operational_state.lower(),
+        "detail": one.admin.detail,
+    }
+
+
 def _declare(group: App, which: str) -> None:
     """Declare `list` and `remove` of a group."""
 
     @group.command("list")
     @options(Connection)
-    def list_(params: Connection) -> None:
+    def list_(params: Connection, as_json: Json = False) -> None:
         """List names, addresses and states."""
         from scan2sim.services.orchestration import sites
 
-        with osm_client(params) as osm:
+        with messages_on_stderr(as_json), osm_client(params) as osm:
             found = osm.sites(sites.COLLECTIONS[which])
+        if as_json:
+            print_json([_facts(one) for one in found])
+            return
         table = Table("name", "kind", "address", "state")
-        for one in found:
-            state = one.admin.operational_state.lower()
-            reason = f": {one.admin.detail[:200]}" if state == "error" and one.admin.detail else ""
-            cells = (one.name, one.vim_type or one.type, one.vim_url or one.url, state + reason)
-            table.add_row(*map(escape, cells))
+        for one in map(_facts, found):
+            reason = f": {one['detail'][:200]}" if one["state"] == "error" and one["detail"] else ""
+            table.add_row(*map(escape, (one["name"], one["kind"], one["address"], one["state"] + reason)))
         console.print(table)
 
     @group.command("remove")

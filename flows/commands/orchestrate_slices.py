@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
-from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.app import App, Json
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, say
 from scan2sim.flows.commands.orchestrate_sites import REQUIREMENT
 from scan2sim.services.orchestration.settings import Connection, OperationParams
+
+if TYPE_CHECKING:
+    from scan2sim.services.orchestration.records import TemplateRecord
 
 NameOrId = Annotated[str, typer.Argument(metavar="NAME", help="Name or id in OSM.")]
 
@@ -23,14 +26,21 @@ app = App("Network slices: services that are instantiated together, from a templ
 
 @app.command("templates")
 @options(Connection)
-def templates(params: Connection) -> None:
+def templates(params: Connection, as_json: Json = False) -> None:
     """List network slice templates (NST) and their network services."""
-    with osm_client(params) as osm:
+    with messages_on_stderr(as_json), osm_client(params) as osm:
         found = osm.templates()
+    if as_json:
+        print_json([{"name": one.name, "id": one.id, "network services": _services(one)} for one in found])
+        return
     table = Table("name", "id", "network services")
     for one in found:
-        table.add_row(*map(escape, (one.name, one.id, ", ".join(subnet.service for subnet in one.subnets))))
+        table.add_row(*map(escape, (one.name, one.id, ", ".join(_services(one)))))
     console.print(table)
+
+
+def _services(template: TemplateRecord) -> list[str]:
+    return [subnet.service for subnet in template.subnets]
 
 
 @app.command("add-template")
@@ -60,10 +70,13 @@ def remove_template(params: Connection, name: NameOrId) -> None:
 
 @app.command("list")
 @options(Connection)
-def list_(params: Connection) -> None:
+def list_(params: Connection, as_json: Json = False) -> None:
     """List network slices (NSI) with their templates and states."""
-    with osm_client(params) as osm:
+    with messages_on_stderr(as_json), osm_client(params) as osm:
         found = osm.slices()
+    if as_json:
+        print_json([{"name": o.name, "template": o.template, "state": o.state, "detail": o.detail} for o in found])
+        return
     table = Table("name", "template", "state")
     for one in found:
         reason = f": {one.detail[:200]}" if one.status == "failed" and one.detail else ""

@@ -14,10 +14,10 @@ import typer
 from rich.table import Table
 
 from scan2sim.flows.commands import qos_table
-from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.app import App, Json
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.qos_table import Json, Out, or_dash
+from scan2sim.flows.commands.qos_table import Out, or_dash
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.types import U8
 from scan2sim.services.qos import requirements

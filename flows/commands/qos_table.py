@@ -31,7 +31,6 @@ def table(title: str, comparisons: list[MetricComparison]) -> Table:
     return result_table
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Out = Annotated[
     Path | None, typer.Option("--out", "-o", help="JSON file for the measurements; input of `orchestrate place`.")
 ]

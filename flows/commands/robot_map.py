@@ -20,6 +20,7 @@ from scan2sim.pipeline.core.cache import Digests, Store
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Tile
 from scan2sim.pipeline.importers.robot_map import MapParams, map_files
+from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.mesh_files import companions, find_mesh
 from scan2sim.pipeline.io.tile import read_tile, tile_name
 from scan2sim.pipeline.io.worlds.merge import link
@@ -101,7 +102,7 @@ def tile_of_map(path: Path, out: Path, params: MapParams, trajectory: Path | Non
         made = store.folder(planned[0].task.full_name, planned[0].key) / "tile"
         tile = folder / "tile"
         shutil.rmtree(tile, ignore_errors=True)
-        shutil.copytree(made, tile, copy_function=link)
+        copy_tree(made, tile, link)
         store.sweep({planned[0].task.id.name: planned[0].key})
         digests.save()
     for text in done[IMPORT_MAP.name].warnings:

@@ -29,6 +29,7 @@ from scan2sim.flows.commands.run_with_progress import execute_with_progress, sho
 from scan2sim.flows.commands.unchanged import Watch
 from scan2sim.flows.engine.execution import Executor, run_to_world
 from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.output_folder import check_own
 from scan2sim.flows.engine.planning import PlannedTask, drop_damaged
 from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.engine.ready_queue import Outcome
@@ -36,7 +37,7 @@ from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.pipelines.graph import TaskId, source_paths
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.pipelines.tile import build_graph
-from scan2sim.flows.reports.publish import publish, to_read
+from scan2sim.flows.reports.publish import PUBLISHED_OUTPUTS, publish, to_read
 from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.flows.reports.tile import DATA, PAGE, write_report
 from scan2sim.pipeline.core.cache import Store
@@ -44,6 +45,8 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.io.tile import read_tile, source_files
 
 app = App()
+RESULTS = (*(folder for _, folder in PUBLISHED_OUTPUTS.values()), PAGE, DATA, "config.json", "exposure.json")
+"""Files and folders that a run writes into its output folder."""
 
 
 @app.command()
@@ -122,6 +125,7 @@ def run_tile(
     """
     began = time.perf_counter()
     tile, side, report = read_tile(path), SideProducts(out), None
+    check_own(out, RESULTS)
     with locked(out):
         watch = Watch([*source_files(tile.path), *source_paths(build_graph(tile, settings))])
         planned, store = plan_tile(tile, out, settings, force, start)

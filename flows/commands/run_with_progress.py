@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from scan2sim.flows.reports import gazebo
 from scan2sim.flows.reports.findings import findings
 from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.pipeline.core.cache import Manifest, Store, digest
+from scan2sim.pipeline.core.cores import available_cores
 
 MAX_FINDINGS = 3
 """Findings printed at the end of a run; the report has all."""
@@ -136,5 +136,4 @@ def default_jobs(tiles: int = 1) -> int:
 
     At least 2, and at most 3 for each tile, as a surface is built for each of three classes.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(max(2, cores // 2), 3 * tiles)
+    return min(max(2, available_cores() // 2), 3 * tiles)

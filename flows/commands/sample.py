@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +12,7 @@ from scan2sim.data_samples.street import generate
 from scan2sim.flows.commands.app import App, Overwrite
 from scan2sim.flows.commands.display import progress
 from scan2sim.pipeline.core import system_libs
+from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.tile_folder import tile_folder
 
 app = App()
@@ -40,7 +40,7 @@ def sample(
     """Generate a synthetic street recording with ground truth, to try the program."""
     with progress("street") as report, tile_folder(out, overwrite) as folder:
         if small:
-            shutil.copytree(SMALL, folder, dirs_exist_ok=True)
+            copy_tree(SMALL, folder)
         else:
             system_libs.check()
             generate(folder, length=length, points=points, photos=photos, seed=seed, traffic=traffic, report=report)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+import os
+from collections.abc import Sequence
+from pathlib import Path, PurePath
 from typing import Annotated
 
 import numpy as np
@@ -14,6 +16,7 @@ from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.run_with_progress import plan_and_run, show_warnings
 from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.output_folder import check_own
 from scan2sim.flows.engine.planning import STORE
 from scan2sim.flows.pipelines.graph import TaskId, required_tasks
 from scan2sim.flows.pipelines.settings import Settings
@@ -27,6 +30,7 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.las_classes import write_classified
 from scan2sim.pipeline.io.tile import read_tile
+from scan2sim.pipeline.io.tile_folder import without_parents
 from scan2sim.segmentation.backends import load
 from scan2sim.segmentation.labels import CLASSES, IGNORED, code_of_index
 from scan2sim.segmentation.metrics import confusion
@@ -99,6 +103,7 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
         ScanError: see `pipeline.core.errors`; results of earlier runs stay.
     """
     tile = read_tile(path)
+    check_own(out, ("classified", "labels", "masks"))
     settings = Settings.of({**settings.values, "sweeps.hold_out": 0})  # every point gets a class
     with locked(out):
         store = Store(out / STORE)
@@ -167,26 +172,39 @@ def _write_clouds(tile: Tile, out: Path, code: np.ndarray, confidence: np.ndarra
             "Convert the clouds to LAZ first",
         )
     at = 0
-    for path, (used, own) in zip(tile.clouds, files, strict=True):
+    names = short_names([os.path.relpath(path, tile.path.parent) for path in tile.clouds])
+    for path, name, (used, own) in zip(tile.clouds, names, files, strict=True):
         part = slice(at, at + int(used.sum()))
         at = part.stop
         columns = own, np.full(len(own), 255, np.uint8), np.full(len(own), SOURCE_CLOUD, np.uint8)
         for whole, given in zip(columns, (code, confidence, source), strict=True):
             whole[used] = given[part]
-        write_classified(path, out / f"{path.stem}.laz", *columns)
+        write_classified(path, out / f"{name}.laz", *columns)
+
+
+def short_names(files: Sequence[str]) -> list[str]:
+    """Names of results by the files that they are of, without suffix: with folders only if that is ambiguous."""
+    paths = [PurePath(without_parents(file)) for file in files]
+    in_folders = [path.with_suffix("").as_posix() for path in paths]
+    for names in ([path.stem for path in paths], in_folders):
+        if len({name.casefold() for name in names}) == len(names):
+            return names
+    return [path.as_posix() for path in paths]
 
 
 def _write_label_images(views: Path, probabilities: Path, out: Path) -> None:
     """Write label images (LAS code of each pixel) and masks: 0 on vehicles, people and the sky, 255 elsewhere."""
     masked = np.isin(np.arange(len(CLASSES)), [CLASSES.index(name) for name in ("vehicle", "person", "sky")])
-    for folder in (out / "labels", out / "masks"):
-        folder.mkdir(exist_ok=True)
-    for i, view in enumerate(views_io.load(views)):
+    photos = views_io.load(views)
+    files = [one.name if Path(one.name).suffix.lower() in image.SUFFIXES else f"{one.name}.png" for one in photos]
+    names = [f"{name}.png" for name in short_names(files)]
+    for i, (view, name) in enumerate(zip(photos, names, strict=True)):
         if (probabilities / f"{i}.npy").is_file():
             best, _ = class_map(np.load(probabilities / f"{i}.npy"), (view.camera.height, view.camera.width))
-            name = f"{Path(view.name).stem}.png"
-            image.write(out / "labels" / name, code_of_index()[best])
-            image.write(out / "masks" / name, np.where(masked[best], 0, 255).astype(np.uint8))
+            mask = np.where(masked[best], 0, 255).astype(np.uint8)
+            for folder, pixels in (("labels", code_of_index()[best]), ("masks", mask)):
+                (out / folder / name).parent.mkdir(parents=True, exist_ok=True)
+                image.write(out / folder / name, pixels)
 
 
 def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, seed: int, start: Path | None) -> None:

@@ -16,6 +16,7 @@ from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.run_with_progress import plan_and_run
 from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.output_folder import check_own
 from scan2sim.flows.engine.planning import STORE, PlannedTask
 from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.pipelines.settings import Settings
@@ -23,6 +24,7 @@ from scan2sim.flows.pipelines.video import ODOMETRY_GROUP, STEPS, Video, build_g
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
 from scan2sim.pipeline.core.errors import LowConfidenceError, SettingError
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.worlds.merge import link
 from scan2sim.slam.trajectory.evaluate import AlignmentKind, Evaluation, evaluate, plot, read_truth
 
@@ -98,6 +100,7 @@ def slam_video(video: Video, out: Path, settings: Settings, bus: PublishedRun | 
         ScanError: see `pipeline.core.errors`; results of earlier runs stay.
     """
     tasks = build_graph(video, settings)
+    check_own(out, (*OUTPUTS, "slam.json"))
     with locked(out):
         store = Store(out / STORE)
         digests = Digests(store.root / "digests.json")
@@ -122,7 +125,7 @@ def publish_path(planned: Iterable[PlannedTask], done: Mapping[str, Manifest], s
         place, source = out / name, sources.get(name)
         shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
         if source is not None:
-            shutil.copytree(source, place, copy_function=link) if source.is_dir() else link(str(source), str(place))
+            copy_tree(source, place, link) if source.is_dir() else link(str(source), str(place))
     (out / "slam.json").write_text(json.dumps(_figures(done), indent=1) + "\n", encoding="utf-8")
 
 

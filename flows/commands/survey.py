@@ -21,6 +21,7 @@ from scan2sim.flows.engine import workers
 from scan2sim.flows.engine.execution import Executor, limit_cores
 from scan2sim.flows.engine.lock import locked
 from scan2sim.flows.engine.memory import parse_memory
+from scan2sim.flows.engine.output_folder import check_own
 from scan2sim.flows.engine.planning import STORE, PlannedTask, Reason, collector_paused, drop_damaged, plan
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.engine.ready_queue import Outcome
@@ -42,6 +43,8 @@ from scan2sim.pipeline.io.survey import Survey, read_survey
 from scan2sim.pipeline.io.tile import read_tile, source_files
 
 app = App()
+SURVEY_RESULTS = ("world", "stac", "survey.html", "survey.json")
+"""Files and folders that a survey writes into its output folder, beside those of its tiles."""
 
 
 @app.command()
@@ -162,6 +165,7 @@ def make_survey(place: str | Path, target: str | Path, settings: Settings, run: 
     survey = read_survey(remote_source.pull_all() if remote_source else Path(place))
     out = local_copy(target)
     log, side = Log(out / "run.log"), SideProducts(out)
+    check_own(out, SURVEY_RESULTS)
     with locked(out), log.errors(out):
         log.write(f"survey {survey.path}, settings {json.dumps(settings.values)}, versions {json.dumps(versions())}")
         store = _store(place, target)

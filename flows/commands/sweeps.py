@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from scan2sim.flows.commands.display import console, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.run_with_progress import plan_and_run
 from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.output_folder import check_own
 from scan2sim.flows.engine.planning import STORE
 from scan2sim.flows.pipelines.graph import Output, Task
 from scan2sim.pipeline.core.cache import Digests, Store
+from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.worlds.merge import link
 
 
-def run_before_import(tasks: Sequence[Task], out: Path) -> dict[str, Path]:
+def run_before_import(tasks: Sequence[Task], out: Path, warn: Callable[[str], None] = warn) -> dict[str, Path]:
     """Run all tasks but the last, the import, and print a summary; finished tasks are cached.
 
     Args:
         tasks: those to run, in order.
         out: folder for cached results, and for an estimated trajectory in all formats; unused if there is only the
             import.
+        warn: receives the warnings of the tasks; default: the terminal.
 
     Returns:
         Inputs of the import by name.
@@ -31,14 +33,17 @@ def run_before_import(tasks: Sequence[Task], out: Path) -> dict[str, Path]:
         ScanError: raised by a step.
     """
     *before, last = tasks
-    return run_cached(before, last.inputs, out)
+    return run_cached(before, last.inputs, out, warn)
 
 
-def run_cached(tasks: Sequence[Task], wanted: Mapping[str, Path | Output], out: Path) -> dict[str, Path]:
+def run_cached(
+    tasks: Sequence[Task], wanted: Mapping[str, Path | Output], out: Path, warn: Callable[[str], None] = warn
+) -> dict[str, Path]:
     """Run tasks as `run_before_import`; returns the paths of `wanted` files and outputs."""
     found = {name: source for name, source in wanted.items() if isinstance(source, Path)}
     if not tasks:
         return found
+    check_own(out)
     with locked(out):
         store = Store(out / STORE)
         digests = Digests(store.root / "digests.json")
@@ -53,7 +58,7 @@ def run_cached(tasks: Sequence[Task], wanted: Mapping[str, Path | Output], out: 
             old.unlink()
         for item in planned:
             if "path" in done[item.task.full_name].files:
-                shutil.copytree(folders[item.task.id] / "path", out, copy_function=link, dirs_exist_ok=True)
+                copy_tree(folders[item.task.id] / "path", out, link)
         store.sweep({item.task.id.name: item.key for item in planned})
         digests.save()
     for manifest in done.values():

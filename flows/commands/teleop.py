@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-import webbrowser
 from contextlib import ExitStack
+from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,8 +14,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from scan2sim.flows.commands import qos_table
-from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.commands.app import App, Json
+from scan2sim.flows.commands.browser import open_page
+from scan2sim.flows.commands.display import console, print_json, progress
 from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.ros_spin import stop_on_signal
 from scan2sim.pipeline.core import optional_deps
@@ -187,15 +188,21 @@ def teleop_audit(
     trail: Annotated[
         Path, typer.Argument(metavar="STATE", help="Folder of the gateway's --state, or its audit.jsonl.")
     ],
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the result and all entries as JSON, also if it finds a change.")
+    ] = False,
 ) -> None:
     """Verify the audit trail: whether an entry was changed, removed or inserted."""
-    from scan2sim.services.teleoperation.gateway.audit import verify
+    from scan2sim.services.teleoperation.gateway.audit import read, verify
 
     path = trail / "audit.jsonl" if trail.is_dir() else trail
     found = verify(path)
+    if as_json:
+        print_json(asdict(found) | {"trail": read(path)})
     if found.damage:
         raise DataError(path, found.damage, "Compare it with a backup")
-    _say(f"{found.entries} entries, none was changed; SHA-256 of the newest: {found.head}")
+    if not as_json:
+        _say(f"{found.entries} entries, none was changed; SHA-256 of the newest: {found.head}")
 
 
 @app.command("vehicle")
@@ -236,14 +243,14 @@ def teleop_demo(
         if window:
             stack.enter_context(app_window.window(running.page))
         elif browse:
-            webbrowser.open(running.page)
+            open_page(running.page)
         while not stop.wait(0.5):
             running.supervise(_say)
 
 
 @app.command("measure")
 @options(MeasureParams)
-def teleop_measure(params: MeasureParams, as_json: qos_table.Json = False, out: qos_table.Out = None) -> None:
+def teleop_measure(params: MeasureParams, as_json: Json = False, out: qos_table.Out = None) -> None:
     """Measure latency, loss and driving of a scripted drive over an emulated network, against 5G-ERA D3.2, table 6."""
     measure_drive(params, "teleoperation", as_json=as_json, out=out)
 

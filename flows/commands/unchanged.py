@@ -60,11 +60,12 @@ class Watch:
         """
         if arguments is None or not self._settled or _out(arguments) is None:
             return
-        state = _digest([self._inputs, _status(_walk(out, OWN_FILES))[0]])
-        body = {"command": _command(arguments), "sources": self._sources, "state": state, "lines": list(lines)}
-        temporary = (out / RECORD).with_suffix(".tmp")
-        temporary.write_text(json.dumps(body), encoding="utf-8")
-        temporary.replace(out / RECORD)
+        with suppress(OSError):  # a link that leads nowhere, a full disk: the next run compares everything
+            state = _digest([self._inputs, _status(_walk(out, OWN_FILES))[0]])
+            body = {"command": _command(arguments), "sources": self._sources, "state": state, "lines": list(lines)}
+            temporary = (out / RECORD).with_suffix(".tmp")
+            temporary.write_text(json.dumps(body), encoding="utf-8")
+            temporary.replace(out / RECORD)
 
 
 def unchanged(given: Sequence[str]) -> list[str] | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import webbrowser
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +10,7 @@ from typing import Annotated
 import typer
 
 from scan2sim.flows.commands.app import App
+from scan2sim.flows.commands.browser import open_page
 from scan2sim.flows.commands.display import console, progress
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.reports import film as films
@@ -86,6 +86,6 @@ def _serve(scene: Scene, params: ViewParams, *, browser: bool) -> None:
             address = f"http://localhost:{served.server_port}/"
             console.print(f"World:  {address}  (Ctrl-C stops the server)", highlight=False, soft_wrap=True)
             if browser:
-                webbrowser.open(address)
+                open_page(address)
             with suppress(KeyboardInterrupt):
                 served.serve_forever()

@@ -17,6 +17,7 @@ from prefect.settings import PREFECT_API_URL, PREFECT_SERVER_EPHEMERAL_STARTUP_T
 
 from scan2sim.pipeline.core.errors import INTERRUPTED, UnavailableError, exit_code
 
+LOOPBACK = "127.0.0.1"
 STOP_TIMEOUT_S = 10.0
 """Time allowed for the temporary server's last requests."""
 
@@ -53,8 +54,8 @@ def _temporary_server() -> Iterator[None]:
 
     config = uvicorn.Config(create_app(ephemeral=True, final=True), log_level="error", lifespan="on")
     server, timeout = uvicorn.Server(config), PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS.value()
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        url = f"http://127.0.0.1:{listener.getsockname()[1]}/api"
+    with socket.create_server((LOOPBACK, 0)) as listener:
+        url = f"http://{LOOPBACK}:{listener.getsockname()[1]}/api"
         thread = threading.Thread(target=server.run, args=([listener],), name="Prefect server", daemon=True)
         thread.start()
         deadline = time.monotonic() + timeout
@@ -63,6 +64,7 @@ def _temporary_server() -> Iterator[None]:
                 remedy = "See its messages above; `prefect server start` starts one that keeps running"
                 raise UnavailableError(url, f"the temporary Prefect server didn't start within {timeout} s", remedy)
             time.sleep(0.05)
+        bypass_proxy(LOOPBACK)
         previous = signal.signal(signal.SIGINT, _exit)
         try:
             with temporary_settings({PREFECT_API_URL: url}):
@@ -71,6 +73,12 @@ def _temporary_server() -> Iterator[None]:
             signal.signal(signal.SIGINT, previous)
             server.should_exit = True
             thread.join(STOP_TIMEOUT_S)
+
+
+def bypass_proxy(host: str) -> None:
+    """Let this process and its children reach a host without the proxy that the environment may name."""
+    for name in ("NO_PROXY", "no_proxy"):
+        os.environ[name] = ",".join(filter(None, (os.environ.get(name), host)))
 
 
 def _exit(*_: object) -> None:

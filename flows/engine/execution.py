@@ -17,6 +17,7 @@ from scan2sim.flows.engine.versions import check_version
 from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.pipeline.core import system_libs
 from scan2sim.pipeline.core.cache import Manifest, Store
+from scan2sim.pipeline.core.cores import THREAD_VARIABLES
 from scan2sim.pipeline.core.errors import DamagedError, ScanError
 
 Executor = Callable[[list[PlannedTask], Store], Outcome]
@@ -122,7 +123,7 @@ def run_to_world(
 def limit_cores(cores: int | None) -> None:
     """Limit the CPU cores of each step that this process starts (None: all); call it before the first step starts."""
     if cores is not None:
-        for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "OPENBLAS_NUM_THREADS"):
+        for name in THREAD_VARIABLES:
             os.environ[name] = str(cores)
 
 

@@ -9,9 +9,11 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scan2sim.pipeline.core import cgroups
 from scan2sim.pipeline.core.errors import SettingError, UnavailableError, from_os_error
 from scan2sim.pipeline.io.images.image import SUFFIXES
 
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 
 SLOT_GB = 0.25  # memory is reserved in slots of this size
 MAX_MEMORY_GB = 20_000  # largest budget that is accepted
+LIMIT_AND_USE = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
+"""Files of a control group with its limit and the memory in use, of versions 2 and 1."""
 FREE_SHARE = 0.8  # of the free memory: estimates are rough, and other programs run
 POLL_INTERVAL_S = 0.2  # seconds between attempts to reserve memory
 
@@ -54,13 +58,16 @@ def parse_memory(text: str | None) -> float | None:
     return size
 
 
-def free_memory(proc: Path = Path("/proc/meminfo"), cgroup: Path = Path("/sys/fs/cgroup")) -> float | None:
-    """GB that steps may use now: most of what the machine, and the container that this runs in, have left.
+def free_memory(
+    proc: Path = Path("/proc/meminfo"), root: Path = cgroups.ROOT, membership: Path = cgroups.MEMBERSHIP
+) -> float | None:
+    """GB that steps may use now: most of what the machine, and the container or job that this runs in, have left.
+
+    Of the memory that a container uses, files that were read are released when needed (`inactive_file`).
 
     Args:
         proc: the kernel's statistics.
-        cgroup: folder of the container's limit (`memory.max`), and what it uses (`memory.current`), of which files that
-            were read are released when needed (`inactive_file` of `memory.stat`).
+        root, membership: as of `cgroups.folders`.
 
     Returns:
         None if it is unknown.
@@ -69,10 +76,11 @@ def free_memory(proc: Path = Path("/proc/meminfo"), cgroup: Path = Path("/sys/fs
     with suppress(OSError):
         available = re.search(r"^MemAvailable:\s+(\d+) kB", proc.read_text(), re.MULTILINE)
         found += [int(available[1]) * 1024] if available else []
-    with suppress(OSError, ValueError):  # "max" is no limit
-        limit, used = (int((cgroup / name).read_text()) for name in ("memory.max", "memory.current"))
-        files = re.search(r"^inactive_file (\d+)", (cgroup / "memory.stat").read_text(), re.MULTILINE)
-        found.append(limit - used + (int(files[1]) if files else 0))
+    for folder, names in product(cgroups.folders("memory", root, membership), LIMIT_AND_USE):
+        with suppress(OSError, ValueError):  # "max" is no limit
+            limit, used = (int((folder / name).read_text()) for name in names)
+            files = re.search(r"^inactive_file (\d+)", (folder / "memory.stat").read_text(), re.MULTILINE)
+            found.append(limit - used + (int(files[1]) if files else 0))
     return max(FREE_SHARE * min(found) / 1e9, SLOT_GB) if found else None
 
 

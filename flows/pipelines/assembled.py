@@ -52,6 +52,7 @@ def import_clouds(
     Args:
         pose_source: "given" uses cloud and trajectory as they are; "auto" checks whether surfaces that were scanned at
             different times agree, and corrects them if they agree clearly better then; "fused" always corrects them.
+            Clouds in another order of `axes` can't be checked: they are used as they are.
         clouds, out, trajectory, crs, units, warn, report: as there.
         options: photos, cameras, images, embedded_images, orthophoto, footprints, conventions, classes, link, overwrite
             and name, as there.
@@ -63,7 +64,7 @@ def import_clouds(
         ScanError: as there.
     """
     given: dict[str, Any] = {"trajectory": trajectory, "crs": crs, "units": units, "warn": warn} | options
-    if trajectory is None or pose_source == "given":
+    if trajectory is None or pose_source == "given" or options.get("axes") is not None:
         return import_las(clouds, out, report=report, **given)
     check_target(out, bool(options.get("overwrite", False)))
     task = check(clouds, trajectory, pose_source, crs=crs, units=units)

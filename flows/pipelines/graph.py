@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,6 +73,12 @@ class Task:
     def full_name(self) -> str:
         """As `TaskId.full_name`."""
         return self.id.full_name
+
+
+def folder_inputs(name: str, folder: Path) -> dict[str, Path]:
+    """A folder and those below it as inputs of a task: the digest of a folder is that of the files in it only."""
+    below = sorted(Path(one) for one, _, _ in os.walk(folder) if Path(one) != folder)
+    return {name: folder} | {f"{name}/{one.relative_to(folder).as_posix()}": one for one in below}
 
 
 def source_paths(tasks: Iterable[Task]) -> set[Path]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from scan2sim.flows.pipelines.graph import Output, Task, TaskId
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId, folder_inputs
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.step import Params, Step
@@ -79,10 +79,12 @@ def build_graph(source: Images, here: Path) -> list[Task]:
         crs = crs_io.LOCAL
 
     times = {name: path for name, path in files.items() if name == "times"}
-    tasks = [Task(RECONSTRUCT, _shared(Reconstructed, source), {"photos": photos, **times})]
+    tasks = [Task(RECONSTRUCT, _shared(Reconstructed, source), {**folder_inputs("photos", photos), **times})]
     made = TaskId(RECONSTRUCT.name)
-    images: Path | Output = Output(made, "frames") if is_video else photos
-    shots = {name: Output(made, name) for name in ("model", "photos", "summary")} | {"images": images}
+    images: dict[str, Path | Output] = {**folder_inputs("images", photos)}
+    if is_video:
+        images = {"images": Output(made, "frames")}
+    shots = {name: Output(made, name) for name in ("model", "photos", "summary")} | images
     beside = {name: path for name, path in files.items() if name != "times"}
     video = {"video": photos} if is_video else {}
     params = PlaceParams(**dict(_shared(Placed, source)), context=PlaceContext(crs=crs))
@@ -90,11 +92,11 @@ def build_graph(source: Images, here: Path) -> list[Task]:
     posed = TaskId(PLACE_PHOTOS.name)
     surface: dict[str, Path | Output] = {} if cloud is None else {"cloud": cloud}
     if cloud is None and placed and colmap.has_cuda():
-        inputs = {"path": Output(posed, "path"), "frame": Output(posed, "frame"), "images": images}
+        inputs = {"path": Output(posed, "path"), "frame": Output(posed, "frame"), **images}
         tasks.append(Task(DENSE_STEREO, _shared(DenseStereoParams, source), inputs))
         surface = {"cloud": Output(TaskId(DENSE_STEREO.name), "cloud")}
     importing = ImportPhotosParams(context=ImportPhotosContext(crs=crs))
-    tasks.append(Task(IMPORT_PHOTOS, importing, {"table": Output(posed, "table"), "images": images, **surface}))
+    tasks.append(Task(IMPORT_PHOTOS, importing, {"table": Output(posed, "table"), **images, **surface}))
     return tasks
 
 

@@ -6,8 +6,8 @@ In a file: `[decimate]` and `[decimate.building]`.
 
 from __future__ import annotations
 
-import copy
 import difflib
+import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -57,7 +57,9 @@ class Settings:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Settings:
-        """From `{"decimate": {"target": 50000}}` or `{"decimate.target": 50000}`, in Python.
+        """From `{"decimate": {"target": 50000}}` or `{"decimate.target": 50000}`, in Python; later ones override.
+
+        Values may be paths, tuples, and numbers and arrays of numpy, too.
 
         Raises:
             SettingError: a name has a wrong form.
@@ -65,9 +67,9 @@ class Settings:
         tables: dict[str, Any] = {}
         for name, value in values.items():
             if "." in name:
-                _assign(tables, name, value, name)
+                _assign(tables, name, _as_in_toml(value), name)
             else:
-                tables[name] = copy.deepcopy(value)
+                tables[name] = _merged(tables.get(name), _as_in_toml(value))
         return cls(tables)
 
     def check(self, steps: Iterable[Step]) -> None:
@@ -112,6 +114,24 @@ class Settings:
         defaults = {**given, **tile_general, **step.class_defaults.get(group, {}), **tile_special}
         merged = {**defaults, **general, **special}
         return step.params.of(step.name, merged | ({"context": context} if context else {}))
+
+
+def _as_in_toml(value: Any) -> Any:
+    """A copy of a value in the types that a file would give: settings are logged and stored as JSON."""
+    if isinstance(value, Mapping):
+        return {name: _as_in_toml(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_as_in_toml(one) for one in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _merged(old: Any, new: Any) -> Any:
+    """A table with the entries of both, those of `new` where both have one; `new` if one of them is no table."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return new
+    return old | {name: _merged(old.get(name), value) for name, value in new.items()}
 
 
 def _split(table: Mapping[str, Any], group: str) -> tuple[dict[str, Any], Mapping[str, Any]]:

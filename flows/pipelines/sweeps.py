@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import Field
 
-from scan2sim.flows.pipelines.graph import Output, Task, TaskId
+from scan2sim.flows.pipelines.graph import Output, Task, TaskId, folder_inputs
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import Shift
 from scan2sim.pipeline.core.step import Params, Step
@@ -61,7 +61,10 @@ class Sweeps(PoseSourceParams, SweepsParams):
         """Input files of the import; paths are relative to `here`."""
         beside = ("poses", "extrinsics", "times", "photos", "photo_times", "mask")
         files = {"sweeps": self.folder, "camera": self.camera_file} | {name: getattr(self, name) for name in beside}
-        return {name: here / path for name, path in files.items() if path is not None}
+        given = {name: here / path for name, path in files.items() if path is not None}
+        if "photos" in given:
+            given |= folder_inputs("photos", given["photos"])
+        return given
 
     def params(self) -> SweepsParams:
         """Parameters of the import, without files."""

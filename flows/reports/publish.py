@@ -15,6 +15,7 @@ from scan2sim.flows.reports.tile import PAGES, SCRIPTS
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import DamagedError
 from scan2sim.pipeline.core.types import Tile
+from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.worlds.merge import (
     STAMP_FILE,
     USER_EDITABLE_SUFFIXES,
@@ -150,8 +151,8 @@ def _publish(source: Path, place: Path, key: str) -> None:
     """Copy a folder from the store (large files as hard links if possible); keeps edits of the same result."""
     fresh = place.with_name(f".{place.name}")
     shutil.rmtree(fresh, ignore_errors=True)
-    shutil.copytree(source, fresh, copy_function=link)
+    copy_tree(source, fresh, link)
     for file in edited(source, place) if _is_from(place, key) else ():
-        shutil.copy2(file, fresh / file.relative_to(place))
+        shutil.copyfile(file, fresh / file.relative_to(place))
     (fresh / STAMP_FILE).write_text(key, encoding="utf-8")
     swap(fresh, place)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import shutil
+import sys
 import threading
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -15,7 +16,7 @@ from pydantic import Field
 
 from scan2sim.flows.reports.tile import PAGES
 from scan2sim.pipeline.core.classes import CODE_OF_SURFACE, colour_of, name_of
-from scan2sim.pipeline.core.errors import SettingError
+from scan2sim.pipeline.core.errors import SettingError, from_os_error
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, View
 from scan2sim.pipeline.io.file_checks import make_folder
@@ -119,6 +120,13 @@ class Pages:
         return f'"{text}"'
 
 
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print the traceback of an error, unless the browser has closed the connection: when its page is left."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
+
+
 def server(pages: Pages, port: int) -> ThreadingHTTPServer:
     """HTTP server of a page, for this machine only; creates tiles on request. Start it by `serve_forever`.
 
@@ -136,7 +144,12 @@ def server(pages: Pages, port: int) -> ThreadingHTTPServer:
                 self.send_error(403, "Use the host name localhost")
                 return
             _, _, script = urlsplit(self.path).path.partition(f"/{TILES}/")
-            pages.write(script)
+            try:
+                pages.write(script)
+            except OSError as error:
+                print(f"error: {from_os_error(error, pages.folder)}", file=sys.stderr)
+                self.send_error(507, "The page can't be written")
+                return
             super().do_GET()
 
         def end_headers(self) -> None:
@@ -147,7 +160,7 @@ def server(pages: Pages, port: int) -> ThreadingHTTPServer:
             pass
 
     try:
-        return ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        return _Server(("127.0.0.1", port), Handler)
     except OSError as error:
         raise SettingError(
             "--port", f"can't listen on port {port} ({error})", "Choose another port, or 0 for any free one"

@@ -21,8 +21,8 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -31,11 +31,13 @@ from typing import Any
 
 from scan2sim.pipeline.core.errors import InputError, from_os_error
 from scan2sim.pipeline.core.parts import Parts
-from scan2sim.pipeline.core.paths import check_inside
+from scan2sim.pipeline.core.paths import check_inside, new_folder
 from scan2sim.pipeline.core.remote import Remote
 from scan2sim.pipeline.core.step import Done, Params, Step
 
 KEY_LENGTH = 24
+SETTLED_NS = 2_000_000_000
+"""Age below which a file's times don't show whether it was written again (FAT: 2 s)."""
 TEMPORARY_PREFIX, CHECKPOINT_PREFIX, PARTS = ".tmp-", ".part-", ".parts"
 
 
@@ -108,13 +110,18 @@ def digest(path: Path) -> str:
 
 
 class Digests:
-    """`digest`, cached in a file for sources whose size, modification time and inode are unchanged.
+    """`digest`, cached in a file for sources whose size, times and inode are unchanged.
 
-    A kilometre of survey is gigabytes: detecting changes must not read all of it again.
+    A kilometre of survey is gigabytes: detecting changes must not read all of it again. The time of the last change of
+    the status counts as well: programs can set the modification time, as "cp -p" and rsync do.
+
+    Args:
+        file: where the digests are cached.
+        clock: time in nanoseconds since the epoch.
     """
 
-    def __init__(self, file: Path) -> None:
-        self._file = file
+    def __init__(self, file: Path, clock: Callable[[], int] = time.time_ns) -> None:
+        self._file, self._clock = file, clock
         try:
             self._known: dict[str, list[Any]] = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -129,10 +136,12 @@ class Digests:
             return digest(path)
         if path.is_dir():
             return content_of({file.name: self(file) for file in path.iterdir() if file.is_file()})
-        fingerprint = [stat.st_size, stat.st_mtime_ns, stat.st_ino]
+        fingerprint = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
         cached = self._known.get(str(path))
-        found = cached[3] if cached and cached[:3] == fingerprint else digest(path)
-        self._used[str(path)] = [*fingerprint, found]
+        settled = stat.st_ctime_ns < self._clock() - SETTLED_NS
+        found = cached[-1] if cached and cached[:-1] == fingerprint else digest(path)
+        if settled:
+            self._used[str(path)] = [*fingerprint, found]
         return str(found)
 
     def save(self) -> None:
@@ -150,7 +159,7 @@ def content_of(digests: Mapping[str, str]) -> str:
     """Digest of all files of a result, computed from their names and digests."""
     combined = hashlib.sha256()
     for name in sorted(digests):
-        combined.update(f"{name}\0{digests[name]}\n".encode())
+        combined.update(f"{name}\0{digests[name]}\n".encode(errors="surrogateescape"))  # names may not be UTF-8
     return combined.hexdigest()
 
 
@@ -300,7 +309,7 @@ class Store:
         try:
             parent = self.root / task
             parent.mkdir(parents=True, exist_ok=True)
-            return Path(tempfile.mkdtemp(prefix=TEMPORARY_PREFIX, dir=parent))
+            return new_folder(parent, TEMPORARY_PREFIX)
         except OSError as error:
             raise from_os_error(error, self.root) from None
 

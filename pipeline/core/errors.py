@@ -123,10 +123,23 @@ def from_exception(error: Exception, where: str, folder: Path) -> ScanError:
         return error
     if isinstance(error, OSError):
         return from_os_error(error, folder)
+    if isinstance(error, UnicodeEncodeError) and is_about_a_file_name(error):
+        return from_name_error(error)
     if isinstance(error, MemoryError):
         return StepError(where, "ran out of memory", "Use a smaller tile, or larger voxels")
     cause = f"failed unexpectedly ({type(error).__name__}: {error})"
     return StepError(where, cause, "The log has the traceback; please report it as a bug")
+
+
+def is_about_a_file_name(error: UnicodeEncodeError) -> bool:
+    """Whether text can't be written as UTF-8 because of a file name in it that isn't (in Latin-1, say)."""
+    return "\udc80" <= error.object[error.start] <= "\udcff"
+
+
+def from_name_error(error: UnicodeEncodeError) -> InputError:
+    """Convert an error for which `is_about_a_file_name` holds."""
+    around = error.object[max(0, error.start - 60) : error.start + 60]
+    return InputError(around, "is a file name that isn't UTF-8", "Rename it (`convmv` renames many files)")
 
 
 def from_os_error(error: OSError, path: str | Path) -> ScanError:

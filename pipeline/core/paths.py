@@ -1,11 +1,19 @@
-"""Path traversal check for file names from untrusted sources (manifests, keys of object storage)."""
+"""Path traversal check for file names from untrusted sources (manifests, keys of object storage); new folders."""
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
 from scan2sim.pipeline.core.errors import InputError
+
+
+def new_folder(parent: Path, prefix: str) -> Path:
+    """Create a folder with a new name, and the permissions that the umask gives, unlike `tempfile.mkdtemp`."""
+    folder = parent / f"{prefix}{secrets.token_hex(4)}"
+    folder.mkdir()
+    return folder
 
 
 def check_inside(folder: Path, names: Iterable[str]) -> None:

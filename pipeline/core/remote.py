@@ -44,9 +44,18 @@ class Remote:
 
     @classmethod
     def of(cls, url: str) -> Remote:
-        """The remote folder at a URL, cached in this user's cache folder."""
+        """The remote folder at a URL, cached in this user's cache folder.
+
+        Raises:
+            UnavailableError: the user has no cache folder, or can't write it.
+        """
         url = url.rstrip("/")
-        cache = Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "scan2sim")
+        try:
+            cache = Path(os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "scan2sim")
+            cache.mkdir(parents=True, exist_ok=True)
+        except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home folder
+            cause = f"can't be copied to this machine ({error})"
+            raise UnavailableError(url, cause, f"Set {CACHE_VARIABLE} to a writable folder") from None
         return cls(url, cache / f"{url.rsplit('/', 1)[-1]}-{hashlib.sha256(url.encode()).hexdigest()[:12]}")
 
     def below(self, name: str) -> Remote:

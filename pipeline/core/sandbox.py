@@ -6,15 +6,19 @@ import ctypes
 import importlib
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
-import tempfile
-from pathlib import Path
+import traceback
 from typing import Any
 
+from scan2sim.pipeline.core.anonymous_file import anonymous_file
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.pipeline.core.open3d_import import leave_out_plots
+
+COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+"""Escape sequences for the colours of a terminal."""
 
 
 def call(target: str, *args: Any, timeout: float, threads: int | None = None) -> Any:
@@ -29,18 +33,20 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
         StepError: the child crashed, raised, or ran out of time.
     """
     # the parent's search path: modules in the user's working folder must not shadow ours
-    environment = dict(os.environ, OMP_WAIT_POLICY="passive", PYTHONPATH=os.pathsep.join(filter(None, sys.path)))
+    folders = [folder for folder in sys.path if isinstance(folder, str) and folder]  # Python skips others, too
+    environment = dict(os.environ, OMP_WAIT_POLICY="passive", PYTHONPATH=os.pathsep.join(folders))
     if threads is not None:
         environment |= {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
-    with tempfile.TemporaryDirectory(prefix="scan2sim-") as folder:
-        exchange = Path(folder)
-        (exchange / "in").write_bytes(pickle.dumps((target, args), protocol=5))
+    with anonymous_file() as given, anonymous_file() as returned:
+        files = given.fileno(), returned.fileno()
+        _write(files[0], (target, args))
         child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "scan2sim.pipeline.core.sandbox", folder],
+            [sys.executable, "-P", "-m", "scan2sim.pipeline.core.sandbox", *map(str, files)],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             env=environment,
             start_new_session=True,
+            pass_fds=files,
         )
         try:
             _, stderr = child.communicate(timeout=timeout)
@@ -51,10 +57,21 @@ def call(target: str, *args: Any, timeout: float, threads: int | None = None) ->
                 os.killpg(child.pid, signal.SIGKILL)
                 child.wait()
         if child.returncode != 0:
-            lines = stderr.decode(errors="replace").strip().splitlines()
+            lines = [line for line in COLOURS.sub("", stderr.decode(errors="replace")).splitlines() if line.strip()]
             cause = lines[-1] if lines and child.returncode > 0 else f"crashed (exit status {child.returncode})"
             raise StepError(target, cause, "Try another seed, backend or resolution")
-        return pickle.loads((exchange / "out").read_bytes())
+        return _read(files[1])
+
+
+def _write(file: int, value: object) -> None:
+    with open(file, "wb", closefd=False) as stream:
+        pickle.dump(value, stream, protocol=5)
+
+
+def _read(file: int) -> Any:
+    os.lseek(file, 0, os.SEEK_SET)  # the position is that of the process that wrote it
+    with open(file, "rb", closefd=False) as stream:
+        return pickle.load(stream)
 
 
 def die_with_parent() -> None:
@@ -64,14 +81,22 @@ def die_with_parent() -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _main(folder: Path) -> None:
+def _main(given: int, returned: int) -> None:
     die_with_parent()
     leave_out_plots()
-    target, args = pickle.loads((folder / "in").read_bytes())
+    target, args = _read(given)
     module, function = target.split(":")
     result = getattr(importlib.import_module(module), function)(*args)
-    (folder / "out").write_bytes(pickle.dumps(result, protocol=5))
+    _write(returned, result)
 
 
 if __name__ == "__main__":
-    _main(Path(sys.argv[1]))
+    status = 1
+    try:
+        _main(int(sys.argv[1]), int(sys.argv[2]))
+        status = 0
+    except Exception:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(status)  # without freeing anything: native libraries can hang or crash there, too

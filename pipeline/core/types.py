@@ -83,6 +83,11 @@ class Camera:
     cy: float = 0.0
     distortion: tuple[float, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Take coefficients as lists, and as arrays, which OpenCV's functions return, too: caches need to hash them."""
+        if not isinstance(self.distortion, tuple):
+            object.__setattr__(self, "distortion", tuple(np.ravel(self.distortion).tolist()))
+
     def scaled(self, factor: float) -> Camera:
         """The camera of the photo resized by `factor` (pixel centres kept aligned)."""
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from scan2sim.pipeline.core.errors import InputError, from_os_error
@@ -86,14 +88,19 @@ def check_data(path: Path) -> Path:
     return path
 
 
+def hidden(path: Path) -> bool:
+    """Whether a file is hidden: macOS writes a `._NAME.SUFFIX` beside each file on exFAT and network drives."""
+    return path.name.startswith(".")
+
+
 def files(folder: Path) -> list[Path]:
-    """Files in a folder, sorted by name.
+    """Files in a folder that aren't hidden, sorted by name.
 
     Raises:
         InputError: it doesn't exist, is no folder, or may not be read.
     """
     try:
-        return sorted(path for path in folder.iterdir() if path.is_file())
+        return sorted(path for path in folder.iterdir() if path.is_file() and not hidden(path))
     except PermissionError:
         raise InputError(folder, NO_PERMISSION, "Change its permissions") from None
     except NotADirectoryError:
@@ -121,6 +128,37 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise from_os_error(error, folder) from error
+
+
+def copy_tree(source: Path, target: Path, copy: Callable[[str, str], object] = shutil.copyfile) -> None:
+    """Copy all files below a folder by `copy(source, target)`, into folders that may exist.
+
+    Contents only: many network drives refuse the permissions and times that `shutil.copytree` copies, too.
+    """
+    target.mkdir(parents=True, exist_ok=True)
+    for entry in sorted(source.iterdir()):
+        if entry.is_dir():
+            copy_tree(entry, target / entry.name, copy)
+        else:
+            copy(str(entry), str(target / entry.name))
+
+
+def copy_with_time(source: Path, target: Path) -> None:
+    """Copy a file with its modification time, if the disk accepts it."""
+    shutil.copyfile(source, target)
+    stat = source.stat()
+    with suppress(PermissionError):
+        os.utime(target, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+
+
+def symlink_or_copy(source: Path, target: Path) -> None:
+    """Make `target` a symbolic link to `source`, or a copy where there are none (exFAT, many network drives)."""
+    try:
+        target.symlink_to(source.resolve())
+    except FileExistsError:
+        raise
+    except OSError:
+        shutil.copyfile(source, target)
 
 
 def link_or_copy(source: Path, target: Path) -> None:

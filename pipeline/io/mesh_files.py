@@ -8,6 +8,7 @@ from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
 
 from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.io import file_checks
 
 SUFFIXES = (".obj", ".glb", ".gltf", ".ply")
 HEAD_BYTES = 1 << 20
@@ -30,7 +31,7 @@ def find_mesh(path: Path) -> Path | None:
     """
     if not path.is_dir():
         return path if is_mesh(path) else None
-    found = sorted(file for file in path.iterdir() if file.is_file() and is_mesh(file))
+    found = [file for file in file_checks.files(path) if is_mesh(file)]
     if len(found) > 1:
         names = ", ".join(file.name for file in found[:5])
         raise InputError(path, f"contains several meshes ({names})", "Give the path of one of them")

@@ -72,15 +72,17 @@ def read_survey(path: Path) -> Survey:
     spec = _parse(path)
     tiles: dict[str, Path] = {}
     crs: dict[str, str] = {}
+    folded: dict[str, str] = {}
     for folder in spec.tiles:
         tile = path.parent / folder / "tile.toml"
         if not tile.is_file():
             raise InputError(tile, f"file not found (named in {path.name})", "Restore it, or remove it from `tiles`")
         name, crs[folder] = _peek(tile)
-        if name in tiles:
+        same = folded.setdefault(name.casefold(), name)  # file systems of macOS and Windows don't distinguish them
+        if same in tiles:
             raise InputError(
                 path,
-                f"names two tiles {name} ({tiles[name].parent.name} and {tile.parent.name})",
+                f"names two tiles {name} ({tiles[same].parent.name} and {tile.parent.name})",
                 "Remove one of them from `tiles`, or give it another `name`",
             )
         tiles[name] = tile

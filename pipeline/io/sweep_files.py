@@ -60,7 +60,8 @@ def list_files(folder: Path, suffixes: Sequence[str] = SWEEP_SUFFIXES, what: str
         return [folder]
     if not folder.exists():
         raise InputError(folder, "folder not found", file_checks.CHECK_PATH)
-    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes] if folder.is_dir() else []
+    inside = folder.iterdir() if folder.is_dir() else ()
+    found = [p for p in inside if p.suffix.lower() in suffixes and not file_checks.hidden(p)]
     if not found:
         raise InputError(folder, f"contains no {what} ({' '.join(suffixes)})", f"Give the folder of the {what}")
     return sorted(found, key=_natural_order)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
 from scan2sim.pipeline.core.errors import InputError, SettingError, from_os_error
+from scan2sim.pipeline.core.paths import new_folder
 from scan2sim.pipeline.io import file_checks
 
 MARKER_FILE = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.json", "page": "view.js",
@@ -17,6 +17,8 @@ MARKER_FILE = {"tile": "tile.toml", "survey": "survey.toml", "world": "metadata.
 """File by which a folder of each kind is recognized."""
 
 
+MAX_PREFIX = 50
+"""Maximum length of the temporary folder's prefix in characters: names of files have at most 255 bytes."""
 Kind = Literal["tile", "survey", "world", "page", "set of variations"]
 
 
@@ -38,29 +40,36 @@ def check_target(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Non
 def tile_folder(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Iterator[Path]:
     """Temporary folder beside `out`: renamed to `out` when the block succeeds, deleted when it raises.
 
+    A mounted disk and the current folder can't be replaced, so their content is.
+
     Args:
         out: the folder to create.
         overwrite: replace an existing folder of the same kind.
         kind: kind of content; only folders with its marker file are overwritten.
 
     Raises:
-        SettingError: as `check_target`.
+        SettingError: as `check_target`; or the new folder has links to files of the one that it would replace.
         SpaceError: the disk is full or not writable.
     """
-    out = Path.cwd() / out
+    out = Path(out).resolve()
     check_target(out, overwrite, kind)
+    stays = out.is_dir() and (out.is_mount() or out.samefile("."))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+        work = new_folder(out if stays else out.parent, f".{out.name}-"[:MAX_PREFIX])
     except OSError as error:
         raise from_os_error(error, out) from error
     try:
-        work.chmod(0o755)  # mkdtemp makes it accessible to the user only
         yield work
         if out.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
-            out.replace(old)
-            work.replace(out)
+            _check_links(work, out)
+            old = new_folder(work.parent, ".old-")
+            if stays:
+                _move_content(out, old, [old, work])
+                _move_content(work, out)
+            else:
+                out.replace(old)
+                work.replace(out)
             shutil.rmtree(old)
         else:
             work.replace(out)
@@ -70,19 +79,38 @@ def tile_folder(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Iter
         shutil.rmtree(work, ignore_errors=True)
 
 
+def _check_links(work: Path, out: Path) -> None:
+    """Check that a new folder has no links to files of the folder that it replaces, which would be lost."""
+    for link in (path for path in work.rglob("*") if path.is_symlink()):
+        source = link.resolve()
+        if source.is_relative_to(out) and not source.is_relative_to(work):
+            remedy = "Leave out --link, or choose another --out"
+            raise SettingError(out, f"contains {source}, which would be lost", remedy)
+
+
+def _move_content(folder: Path, target: Path, without: Sequence[Path] = ()) -> None:
+    for path in list(folder.iterdir()):
+        if path not in without:
+            path.replace(target / path.name)
+
+
 def add_file(source: Path, folder: Path, name: str, link: bool = False) -> str:
     """Copy (or symlink, by absolute path) `source` to `folder/name`; returns `name`.
 
     Raises:
-        InputError: the source is missing, or the name is already used by another file.
+        InputError: the source is missing, the name is already used by another file, or can't be written in a tile.toml.
     """
     target = folder / name
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise InputError(source, "has a name that isn't UTF-8", "Rename it (`convmv` renames many files)") from None
     file_checks.check(source, "Check the path, or remove the entry that names it")
     if target.exists() or target.is_symlink():
         raise InputError(source, f"is the second file with the name {name} in the tile", "Rename one of them")
     target.parent.mkdir(parents=True, exist_ok=True)
     if link:
-        target.symlink_to(source.resolve())
+        file_checks.symlink_or_copy(source, target)
     else:
         shutil.copyfile(source, target)
     return name

@@ -12,6 +12,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Camera, View
+from scan2sim.pipeline.io.file_checks import symlink_or_copy
 
 CAMERA_FIELDS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
 
@@ -46,12 +47,12 @@ def from_json(entry: dict[str, Any]) -> View:
 
 
 def with_links(view: View, folder: Path, index: int) -> View:
-    """The view with its photo and mask symlinked into `folder`; its paths are relative to `folder`."""
+    """The view with its photo and mask linked into `folder`, to which its paths are relative."""
 
     def link(file: Path, subfolder: str) -> Path:
         (folder / subfolder).mkdir(exist_ok=True)
         target = folder / subfolder / f"{index:05d}_{file.name}"
-        target.symlink_to(file.resolve())
+        symlink_or_copy(file, target)
         return target.relative_to(folder)
 
     return replace(view, photo=link(view.photo, "photos"), mask=link(view.mask, "masks") if view.mask else None)

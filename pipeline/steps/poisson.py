@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
+from scan2sim.pipeline.core.cores import available_cores
 from scan2sim.pipeline.core.errors import StepError
 from scan2sim.pipeline.core.parameters import Seconds
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
@@ -155,7 +155,7 @@ def _solve(
             return error
         return found
 
-    processes = min(params.threads or cores(), len(problems))
+    processes = min(params.threads or available_cores(), len(problems))
     shares: list[list[int]] = [[] for _ in range(processes)]
     for i in sorted(
         range(len(problems)), key=lambda i: -len(problems[i].xyz)
@@ -199,11 +199,6 @@ def octree(length: float, cell: float) -> tuple[int, float]:
     return min(depth, MAX_DEPTH), max(CUBE_SCALE, cell * 2**depth / length)
 
 
-def cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def reconstruct(problems: list[Problem]) -> list[Surface]:
     """Screened Poisson surface of each block by Open3D, on one thread: several threads give results that vary."""
     import open3d as o3d
@@ -227,5 +222,5 @@ POISSON = Step(
     poisson,
     PoissonParams,
     per_class=True,
-    memory=(0.4, 35.0 * min(max(cores(), 2), 6)),  # GB of a block's process, of which one runs on each core
+    memory=(0.4, 35.0 * min(max(available_cores(), 2), 6)),  # GB of a block's process, of which one runs on each core
 )

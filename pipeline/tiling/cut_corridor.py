@@ -142,7 +142,7 @@ def cut_survey(
     corridor = Corridor.read(path)
     tile, spec = corridor.tile, corridor.spec
     name = tile_name(name or spec.name)[: MAX_NAME - NUMBER_WIDTH]
-    final = (Path.cwd() / out).parent.resolve() / out.name
+    final = out.resolve()
     if any(source.resolve().is_relative_to(final) for source in (tile.path, *tile.clouds)):
         raise SettingError(out, f"contains the corridor {tile.path}", "Choose another folder")
     for note in corridor.notes:

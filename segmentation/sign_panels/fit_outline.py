@@ -9,7 +9,6 @@ Import late: it loads numba.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit
 
+from scan2sim.pipeline.core.cores import available_cores
 from scan2sim.pipeline.core.types import F32, F64, U8, View
 from scan2sim.pipeline.furniture.sign_panels import ASPECT, OUTLINES, PANEL_SIZE_M, Shape, SignPanel, inside
 
@@ -219,7 +219,7 @@ def _best_of_all_shapes(
         low, high: (K,) bounds of the other parameters.
         heading_starts: starting values for the change of the heading in radians.
     """
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(available_cores()) as pool:
         best = list(pool.map(lambda shape: _best_of_shape(photos, shape, at, low, high), OUTLINES))
     candidates = [panel for panel in best if panel is not None and photos.shows(panel, CANDIDATE_SHARE)]
     found = [_outermost(photos, panel, heading_starts) for panel in candidates]

@@ -19,7 +19,7 @@ import httpx
 from pydantic_core import from_json
 
 from scan2sim.pipeline.core.errors import SettingError, StepError, UnavailableError, printable
-from scan2sim.services.credentials import redacted
+from scan2sim.services.credentials import redacted, secrets_of, without
 from scan2sim.services.orchestration import certificates, records
 from scan2sim.services.orchestration.package import Package
 from scan2sim.services.orchestration.records import (
@@ -346,7 +346,7 @@ class Osm:
                 break
             token = self._valid_token(rejected=token)  # OSM may revoke a token before its expiry
             status, answer = self._send(method, path, body, headers, token)
-        return _checked(status, answer, f"{method} {path}")
+        return _checked(status, answer, f"{method} {path}", body)
 
     def _valid_token(self, rejected: str = "") -> str:
         """A token that isn't about to expire and isn't the rejected one; logs in if necessary."""
@@ -355,7 +355,7 @@ class Osm:
                 credentials = {"username": self._user, "password": self._password, "project_id": self._project}
                 where = f"POST {TOKENS}"
                 try:
-                    answer = _checked(*self._send("POST", TOKENS, credentials, {}, None), where)
+                    answer = _checked(*self._send("POST", TOKENS, credentials, {}, None), where, credentials)
                 except OsmError as error:
                     if error.status == 404:
                         cause = f"OSM doesn't know the project {self._project} ({error.status})"
@@ -455,8 +455,13 @@ def collection_of(package: Package) -> str:
     return FUNCTIONS if package.descriptor.type == "vnfd" else SERVICES
 
 
-def _checked(status: int, body: bytes, where: str) -> Any:
+def _checked(status: int, body: bytes, where: str, sent: Any) -> Any:
     """Decoded body of a response.
+
+    Args:
+        status, body: of the response.
+        where: the request, for messages.
+        sent: body of the request, whose credentials OSM's messages may quote.
 
     Raises:
         OsmError: it is an error response, or not JSON.
@@ -473,16 +478,16 @@ def _checked(status: int, body: bytes, where: str) -> Any:
         cause = f"the server redirects to {redacted(target)} ({status})"
         raise OsmError(where, cause, "Give --osm the address of the northbound interface itself", status)
     cause, remedy = HTTP_ERRORS.get(status, ("unexpected response of OSM", HTTP_ERRORS[500][1]))
-    raise OsmError(where, f"{cause} ({status}{_detail(body)})", remedy, status)
+    raise OsmError(where, f"{cause} ({status}{_detail(body, sent)})", remedy, status)
 
 
-def _detail(body: bytes) -> str:
+def _detail(body: bytes, sent: Any) -> str:
     try:
         found = from_json(body)
     except ValueError:
         return ""
     detail = found.get("detail") if isinstance(found, dict) else None
-    return f": {printable(str(detail))[:ERROR_DETAIL_MAX_CHARS]}" if detail else ""
+    return f": {printable(without(str(detail), secrets_of(sent)))[:ERROR_DETAIL_MAX_CHARS]}" if detail else ""
 
 
 def _validated(kind: type[Answer], answer: Any, where: str) -> Answer:

@@ -2,23 +2,76 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from scan2sim.pipeline.core.errors import InputError, StepError
+from scan2sim.pipeline.core.errors import InputError, SettingError, StepError
+from scan2sim.services.credentials import is_secret, redacted, secrets_of, without
 from scan2sim.services.orchestration import lifecycle
 from scan2sim.services.orchestration.lifecycle import Notify, WaitPolicy
 from scan2sim.services.orchestration.osm import CLUSTERS, REPOSITORIES, SITE_KINDS, VIMS, Osm
 from scan2sim.services.orchestration.sol006 import LINK_ID
 
 MAX_FILE_BYTES = 1_000_000
-"""Maximum size of a kubeconfig."""
+"""Maximum size of a kubeconfig, or of a VIM's settings."""
 
 
-def vim_request(name: str, url: str, *, kind: str, user: str, password: str, tenant: str) -> dict[str, Any]:
-    """Body of the request that registers a VIM account; `kind` is the type of the VIM, such as openstack."""
+def read_secret(path: Path) -> str:
+    """A password or token in a text file.
+
+    Raises:
+        InputError: the file can't be read, or is empty.
+    """
+    remedy = "Give a text file that holds it"
+    try:
+        found = path.read_text("utf-8").strip()
+    except (OSError, UnicodeError) as error:
+        raise InputError(path, f"can't be read ({error})", remedy) from None
+    if not found:
+        raise InputError(path, "is empty", remedy)
+    return found
+
+
+def vim_config(path: Path | None, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a VIM that depend on its type, such as `security_groups` and `insecure` of OpenStack.
+
+    Args:
+        path: YAML or JSON file with them; None: no file.
+        given: further ones from the command line, which override those of the file.
+
+    Raises:
+        InputError: the file isn't a mapping of names to values. SettingError: a credential is given on the command
+            line, where other users of the machine see it, or a value can't be sent as JSON.
+    """
+    if wrong := next(filter(is_secret, given), None):
+        cause = f"{wrong} is a credential, which other users see on the command line"
+        raise SettingError("--set", cause, "Put it in the file of --config")
+    remedy = "Write a mapping, such as: security_groups: [default]"
+    found = {} if path is None else _read_yaml(path, "a file of settings", remedy)
+    if not isinstance(found, dict):
+        raise InputError(path or "--config", "not a mapping of names to values", remedy)
+    config = {str(name): value for name, value in found.items()} | dict(given)
+    try:
+        json.dumps(config, allow_nan=False)
+    except (TypeError, ValueError):
+        cause = "has a value that JSON doesn't have, such as a date"
+        raise SettingError("--config", cause, "Put it in quotes") from None
+    return config
+
+
+def vim_request(
+    name: str, url: str, *, kind: str, user: str, password: str, tenant: str, config: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Body of the request that registers a VIM account.
+
+    Args:
+        kind: type of the VIM, such as openstack.
+        user, password, tenant: account and project at the VIM.
+        config: settings that depend on the type of the VIM; without any, none are sent.
+    """
     return {
         "name": name,
         "vim_type": kind,
@@ -26,7 +79,7 @@ def vim_request(name: str, url: str, *, kind: str, user: str, password: str, ten
         "vim_user": user,
         "vim_password": password,
         "vim_tenant_name": tenant,
-    }
+    } | ({"config": dict(config)} if config else {})
 
 
 def cluster_request(name: str, kubeconfig: Path, *, vim: str, version: str, network: str | None) -> dict[str, Any]:
@@ -52,23 +105,43 @@ def cluster_request(name: str, kubeconfig: Path, *, vim: str, version: str, netw
     }
 
 
-def repository_request(name: str, url: str) -> dict[str, Any]:
-    """Body of the request that registers a repository of Helm charts, by HTTP or `oci://`."""
-    return {"name": name, "type": "helm-chart", "url": url}
+def repository_request(name: str, url: str, *, user: str | None = None, password: str | None = None) -> dict[str, Any]:
+    """Body of the request that registers a repository of Helm charts.
+
+    Args:
+        url: its address, https:// or oci://.
+        user, password: login of a private repository; None: it is public.
+
+    Raises:
+        SettingError: the address contains a login, which OSM would list, or a login isn't complete.
+    """
+    if (user is None) != (password is None):
+        missing = "--repo-user" if user is None else "--repo-password"
+        raise SettingError(missing, "missing: a login is a user name and a password", "Give both, or neither")
+    if redacted(url) != url:
+        raise SettingError("URL", "contains a login", "Give --repo-user, and a file with the password: --repo-password")
+    body: dict[str, Any] = {"name": name, "type": "helm-chart", "url": url}
+    if url.startswith("oci://"):
+        body["oci"] = True
+    return body if user is None else body | {"user": user, "password": password}
 
 
-def _read_kubeconfig(path: Path) -> dict[str, Any]:
+def _read_yaml(path: Path, what: str, remedy: str) -> Any:
     import yaml
 
-    remedy = "Give the file that kubectl uses, with its certificates inside (kubectl config view --raw --minify)"
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
-            raise InputError(path, "too large for a kubeconfig", remedy)
-        found = yaml.safe_load(path.read_text("utf-8"))
+            raise InputError(path, f"too large for {what}", remedy)
+        return yaml.safe_load(path.read_text("utf-8"))
     except OSError as error:
         raise InputError(path, f"can't be read ({error.strerror})", remedy) from None
     except (yaml.YAMLError, ValueError, RecursionError):
-        raise InputError(path, "not a kubeconfig (invalid YAML)", remedy) from None
+        raise InputError(path, f"not {what} (invalid YAML)", remedy) from None
+
+
+def _read_kubeconfig(path: Path) -> dict[str, Any]:
+    remedy = "Give the file that kubectl uses, with its certificates inside (kubectl config view --raw --minify)"
+    found = _read_yaml(path, "a kubeconfig", remedy)
     if not isinstance(found, dict) or found.get("kind") != "Config" or not isinstance(found.get("clusters"), list):
         raise InputError(path, "not a kubeconfig", remedy)
     files = [
@@ -100,15 +173,17 @@ def add(osm: Osm, collection: str, body: Mapping[str, Any], wait_policy: WaitPol
     if new:
         osm.add_site(collection, body)
     if wait_policy.wait:
-        _wait_until_usable(osm, collection, name, wait_policy, notify)
+        _wait_until_usable(osm, collection, body, wait_policy, notify)
     return new
 
 
-def _wait_until_usable(osm: Osm, collection: str, name: str, wait_policy: WaitPolicy, notify: Notify) -> None:
-    ends = time.monotonic() + wait_policy.timeout
+def _wait_until_usable(
+    osm: Osm, collection: str, body: Mapping[str, Any], wait_policy: WaitPolicy, notify: Notify
+) -> None:
+    name, ends = str(body["name"]), time.monotonic() + wait_policy.timeout
     while not wait_policy.stop():
         found = osm.site(collection, name)
-        state, detail = found.admin.operational_state, found.admin.detail[:300]
+        state, detail = found.admin.operational_state, without(found.admin.detail, secrets_of(body))[:300]
         if state == "ENABLED":
             return
         if state == "ERROR":

@@ -1,4 +1,5 @@
-// Alarms on the dashboard of the event bus: the strip at the top, and the table with buttons to acknowledge and mute them.
+// Alarms on the dashboard of the event bus: the strip at the top, the table with buttons to acknowledge and mute them, and
+// the button that retires a node.
 "use strict";
 
 const NAMED_ALARMS = 3; // alarms that are named in the strip at the top
@@ -9,7 +10,8 @@ function alarmState(one) {
   return (one.acknowledged_by ? `acknowledged by ${one.acknowledged_by}` : "raised") + muted;
 }
 
-function showAlarms({ raised, cleared }, events_topic) {
+// `gone`: whether there are nodes that can be retired.
+function showAlarms({ raised, cleared }, events_topic, gone) {
   const strip = byId("alarm"),
     urgent = raised.filter((one) => !one.acknowledged_by && one.muted_until < Date.now() / 1000);
   strip.hidden = !urgent.length;
@@ -22,6 +24,7 @@ function showAlarms({ raised, cleared }, events_topic) {
       (urgent.length > NAMED_ALARMS ? `; and ${urgent.length - NAMED_ALARMS} more` : "")
     : "";
   if (strip.textContent !== text) strip.textContent = text; // so that a screen reader announces it once
+  byId("handling").hidden = !raised.length && !gone;
   const shown = JSON.stringify([raised, cleared, alarmUser(), Math.floor(Date.now() / 10000)]); // mutings end by time
   const table = byId("alarms");
   if (table.dataset.shown === shown) return; // don't replace buttons that may be about to be clicked
@@ -43,7 +46,6 @@ function showAlarms({ raised, cleared }, events_topic) {
   });
   table.tBodies[0].replaceChildren(...rows);
   table.parentElement.hidden = !rows.length;
-  byId("handling").hidden = !raised.length;
   byId("calm").textContent = rows.length ? "" : `None on ${events_topic}.`;
 }
 
@@ -61,8 +63,10 @@ function alarmButtons(one) {
   if (one.until === undefined) {
     const muted = one.muted_until > Date.now() / 1000,
       anonymous = !alarmUser();
-    const acknowledge = () => commandAlarm(one, "acknowledge", {});
-    const mute = () => commandAlarm(one, "mute", { seconds: muted ? 0 : Number(handling.seconds.value) });
+    const { rule, subject } = one,
+      acknowledge = () => command("acknowledge", `${rule}, ${subject}`, "alarms/acknowledge", { rule, subject }),
+      seconds = () => (muted ? 0 : Number(handling.seconds.value)),
+      mute = () => command("mute", `${rule}, ${subject}`, "alarms/mute", { rule, subject, seconds: seconds() });
     place.append(
       button("Acknowledge", anonymous || one.acknowledged_by !== "", acknowledge),
       button(muted ? "Unmute" : "Mute", anonymous, mute),
@@ -73,14 +77,21 @@ function alarmButtons(one) {
   return cell;
 }
 
-// Sends a command to the alarm node, which publishes the alarm again when it has followed it.
-async function commandAlarm({ rule, subject }, action, more) {
+// A button that retires a node that is gone for good.
+function retireButton(node) {
+  const made = button("Retire", !alarmUser(), () => command("retire", node, "nodes/retire", { node }));
+  made.title = alarmUser() ? `${node} is gone for good: end its alarms, and don't list it` : "Enter your name at Alarms first";
+  return made;
+}
+
+// Sends a command to the alarm node, which publishes alarms again when it has followed it.
+async function command(action, what, path, body) {
   const answer = byId("answer");
   answer.className = "soft";
-  answer.textContent = `${action}: ${rule}, ${subject} ...`;
+  answer.textContent = `${action}: ${what} ...`;
   try {
-    await send("POST", `/api/alarms/${action}`, JSON.stringify({ rule, subject, by: alarmUser(), ...more }));
-    answer.textContent = `Sent to the alarm node: ${action} ${rule}, ${subject}.`;
+    await send("POST", `/api/${path}`, JSON.stringify({ ...body, by: alarmUser() }));
+    answer.textContent = `Sent to the alarm node: ${action} ${what}.`;
   } catch (error) {
     answer.className = "bad";
     answer.textContent = error.message;

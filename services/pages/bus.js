@@ -89,11 +89,12 @@ function applyUpdate(update) {
 function showState(state) {
   const { topic, servers, connected, limits, nodes, runs, counts, last_rejected, events_topic, events_rejected } = state;
   byId("topic").textContent = `${topic} and ${events_topic} on ${servers}`;
-  showAlarms(state.alarms, events_topic);
+  nodes.sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true })); // node_2 before node_10
+  const gone = nodes.filter((node) => node.gone);
+  showAlarms(state.alarms, events_topic, gone.length > 0);
   showRuns(runs, state.now);
   showQueues(state.queues);
   if (range.seconds) status(connected ? "live" : "lost", connected ? "live" : "Kafka is unreachable");
-  nodes.sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true })); // node_2 before node_10
   const empty = byId("empty");
   empty.hidden = nodes.length > 0 || runs.length > 0;
   byId("plots").hidden = !nodes.length && runs.length > 0;
@@ -102,10 +103,7 @@ function showState(state) {
     : `Kafka at ${servers} doesn't answer; retrying.`;
   showChips(by === "node" ? nodes : state.topics.map(({ topic, number }) => ({ name: topic, number, gone: false })));
   byId("nodes").tBodies[0].replaceChildren(...nodes.filter((node) => !node.gone).map((node) => row(node, limits)));
-  showGone(
-    nodes.filter((node) => node.gone),
-    limits,
-  );
+  showGone(gone, limits);
   showTopics(state.topics);
   const warnings = nodes.flatMap((node) => [
     ...node.warnings.map((text) => `${node.name}: ${text}`),
@@ -129,20 +127,47 @@ function listed(counts) {
     .join(", ");
 }
 
-// Nodes that are silent, folded away, with their last values.
+// Nodes that are silent, folded away, with their last values, and a button that retires each.
 function showGone(gone, limits) {
   const folded = byId("gone"),
-    table = folded.querySelector("table");
+    table = folded.querySelector("table"),
+    shown = JSON.stringify([gone.map(({ silent, ...node }) => node), limits, alarmUser(), document.documentElement.dataset.theme]);
   folded.hidden = !gone.length;
   folded.querySelector("summary").textContent = `${gone.length} gone`;
-  if (!table.tHead) table.prepend(byId("nodes").tHead.cloneNode(true));
-  table.tBodies[0].replaceChildren(...gone.map((node) => row(node, limits)));
+  if (!table.tHead) {
+    table.prepend(byId("nodes").tHead.cloneNode(true));
+    table.tHead.rows[0].append(element("th"));
+  }
+  if (table.dataset.shown !== shown) {
+    table.dataset.shown = shown;
+    const rows = gone.map((node) => {
+      const made = row(node, limits),
+        cell = element("td");
+      cell.append(retireButton(node.name));
+      made.append(cell);
+      return made;
+    });
+    table.tBodies[0].replaceChildren(...rows);
+    return;
+  }
+  const { rows } = table.tBodies[0]; // don't replace buttons that may be about to be clicked
+  gone.forEach((node, index) => (rows[index].cells[1].textContent = stateOf(node)));
 }
+
+const stateOf = (node) => (node.gone ? `gone, silent for ${duration(node.silent)}` : `every ${+node.period.toPrecision(3)} s`);
 
 // Buttons that select nodes or topics; nodes that are silent are folded away.
 function showChips(lines) {
   const chips = byId("chips"),
     chosen = selected[by],
+    unlisted = [...chosen].filter((name) => !lines.some((line) => line.name === name));
+  if (by === "node" && lines.length && unlisted.length) {
+    // retired nodes have no button that deselects them
+    for (const name of unlisted) chosen.delete(name);
+    return begin();
+  }
+  const open = chips.querySelector("details")?.open,
+    gone = lines.filter((one) => one.gone),
     shown = JSON.stringify([
       by,
       lines.map(({ name, number, gone }) => [name, number, gone]),
@@ -152,8 +177,6 @@ function showChips(lines) {
   if (chips.dataset.shown === shown) return; // don't replace elements that may be about to be clicked
   chips.dataset.shown = shown;
   chips.classList.toggle("some", chosen.size > 0);
-  const open = chips.querySelector("details")?.open,
-    gone = lines.filter((one) => one.gone);
   chips.replaceChildren(...lines.filter((one) => !one.gone).map(chip));
   if (!gone.length) return;
   const folded = element("details"),
@@ -184,11 +207,7 @@ function row(node, limits) {
   name.append(key(node.number), element("span", node.name));
   made.append(
     name,
-    element(
-      "td",
-      node.gone ? `gone, silent for ${duration(node.silent)}` : `every ${+node.period.toPrecision(3)} s`,
-      node.gone ? "bad" : "",
-    ),
+    element("td", stateOf(node), node.gone ? "bad" : ""),
   );
   const machine = element("td");
   machine.append(element("span", [node.host, node.ip].filter(Boolean).join(" · ")));

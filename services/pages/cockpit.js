@@ -55,7 +55,7 @@ class Camera {
     this.figure.append(this.canvas, this.cover, this.caption);
     this.captured = -Infinity;
     const later = [...cameras.values()].find((one) => one.number > number); // the first camera is the largest
-    byId("cameras").insertBefore(this.figure, later?.figure ?? null);
+    byId("cameras").insertBefore(this.figure, later?.figure ?? byId("map"));
     const canvas = this.canvas.transferControlToOffscreen();
     worker.postMessage({ canvas, camera: number }, [canvas]);
   }
@@ -320,6 +320,7 @@ function watchdog() {
   write(byId("gear"), vehicle ? GEARS[driving() ? gear : vehicle.gear] : "-");
   write(byId("command"), Number.isFinite(telemetry?.age) ? `${Math.round(telemetry.age)}` : "-");
   showLinks(telemetry ? station.links : []);
+  showMap(vehicle);
   byId("take").disabled = station.driver !== null;
   byId("leave").disabled = !driving();
   byId("agree").disabled = !driving() || !telemetry?.standing || station.why !== "" || Boolean(station.latched);
@@ -412,6 +413,7 @@ async function connect() {
     byId("token").hidden = !(error instanceof NoToken);
     throw error instanceof NoToken ? new Error("a token is required") : error;
   }
+  loadMap();
   const token = sessionStorage.getItem("token"),
     url = `${location.origin.replace(/^http/, "ws")}/live`;
   const ended = new Promise((done) => (closed = done));

@@ -52,8 +52,11 @@ function card(one, pairText) {
   return [made, line];
 }
 
+// Who has control, and since when; a station of an earlier version doesn't report it.
+const driver = (one) => (one.driver ? ` by ${one.driver} since ${time(one.driver_since)}` : "");
+
 function vehicle(one, stations) {
-  const [made, line] = card(one, one.other ? `driven from ${one.other}` : "no station");
+  const [made, line] = card(one, one.other ? `driven from ${one.other}${driver(one)}` : "no station");
   const choice = element("span", undefined, "choice"),
     speed = element("output"),
     select = element("select");
@@ -73,7 +76,7 @@ function vehicle(one, stations) {
   return made;
 }
 
-const station = (one) => card(one, one.other ? `drives ${one.other}` : "no vehicle")[0];
+const station = (one) => card(one, one.other ? `drives ${one.other}${driver(one)}` : "no vehicle")[0];
 
 function auditRow(one) {
   const made = element("tr");

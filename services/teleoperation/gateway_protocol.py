@@ -95,6 +95,8 @@ class Status(_Message):
         message: for driver or operator: why the vehicle is stopped, or which clock is wrong.
         speed: of a vehicle, m/s.
         age: ms; of the last command for a vehicle, of the video for a station.
+        driver: who has control at a station; empty: nobody.
+        held: seconds since that driver took control.
     """
 
     kind: Literal["status"] = "status"
@@ -104,6 +106,8 @@ class Status(_Message):
     message: Text = ""
     speed: Finite | None = None
     age: Finite | None = None
+    driver: Text = ""
+    held: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
 
 
 class DriverRequest(_Message):

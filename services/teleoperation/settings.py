@@ -59,6 +59,15 @@ class GatewayParams(ServerParams):
     )
 
 
+MapWorld = Annotated[
+    File | None,
+    Field(
+        description="Folder of a finished world whose roads the driver page shows as a map, for a vehicle that reports "
+        "its position in this world. Default: no map."
+    ),
+]
+
+
 class StationParams(ServerParams):
     """Settings of a station; `ServerParams` has those of its web page."""
 
@@ -75,6 +84,7 @@ class StationParams(ServerParams):
             "--token. Default: anybody who has the page drives."
         ),
     ] = None
+    world: MapWorld = None
     record: Annotated[
         File | None,
         Field(description="Folder to record drives in, as MCAP. Default: drives are not recorded."),
@@ -104,6 +114,7 @@ class ReplayParams(ServerParams):
 
     recording: Annotated[File, Field(description="Folder of `teleop station --record`, or one drive in it.")]
     speed: Annotated[float, Field(ge=0.1, le=20, description="Speed of the replay; 1: as recorded.")] = 1.0
+    world: MapWorld = None
 
 
 class ExportParams(Params):

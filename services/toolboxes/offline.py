@@ -12,6 +12,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.images.video import Encoder
 from scan2sim.services.toolboxes import frames, sources, tasks
 from scan2sim.services.toolboxes.engine import Engine
@@ -35,7 +36,7 @@ def process_files(engine: Engine, path: Path, out: Path, report: Report, *, draw
     out.mkdir(parents=True, exist_ok=True)
     ended: dict[str, int] = {}
     with ExitStack() as stack:
-        lines = stack.enter_context((out / RESULTS_FILE).open("w"))
+        lines = stack.enter_context((out / RESULTS_FILE).open("w", encoding="utf-8"))
         drawings = stack.enter_context(_DrawnResults(engine.name, out, rate)) if draw else None
         for number, (frame, result) in enumerate(_results(engine, path)):
             _write_line(lines, result)
@@ -94,14 +95,12 @@ class _DrawnResults:
 
     def add(self, frame: Frame, result: Result) -> None:
         """Draw a result and write the image."""
-        import cv2
-
         assert result.body
         drawn = self._task.draw(frames.rgb(frame), result.body)
         if self._rate is None:
             folder = self._out / IMAGES_FOLDER
             folder.mkdir(exist_ok=True)
-            cv2.imwrite(str(folder / f"{Path(frame.id).stem}.jpg"), drawn[..., ::-1])
+            image.write(folder / f"{Path(frame.id).stem}.jpg", drawn, quality=95)
             return
         self._add_to_video(np.ascontiguousarray(drawn[: drawn.shape[0] // 2 * 2, : drawn.shape[1] // 2 * 2]))
 

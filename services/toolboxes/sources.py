@@ -18,6 +18,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError, ScanError
 from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images import image as photos
 from scan2sim.services.credentials import redacted
 from scan2sim.services.supervision import SupervisedThread
@@ -61,7 +62,7 @@ def rate_of(path: Path) -> float | None:
     """Frame rate of a video in Hz; None for images."""
     import cv2
 
-    return None if _holds_images(path) else cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FPS) or None
+    return None if _holds_images(path) else cv2.VideoCapture(str(path.absolute())).get(cv2.CAP_PROP_FPS) or None
 
 
 def count(path: Path) -> int:
@@ -74,7 +75,7 @@ def count(path: Path) -> int:
 
     if _holds_images(path):
         return len(_image_files(path))
-    return max(1, int(cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT)))
+    return max(1, int(cv2.VideoCapture(str(path.absolute())).get(cv2.CAP_PROP_FRAME_COUNT)))
 
 
 def stored_images(path: Path) -> Iterator[StoredImage]:
@@ -89,7 +90,7 @@ def stored_images(path: Path) -> Iterator[StoredImage]:
         return
     import cv2
 
-    video = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(str(path.absolute()))
     rate, number = video.get(cv2.CAP_PROP_FPS) or 25.0, 0
     while (image := _read(video)) is not None:
         yield StoredImage(f"{number:06}", round(number / rate * 1e9), image)
@@ -118,7 +119,7 @@ def _holds_images(path: Path) -> bool:
 def _image_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
-    files = sorted(one for one in path.iterdir() if one.is_file())
+    files = file_checks.files(path)
     found = [one for one in files if one.suffix.lower() in photos.SUFFIXES]
     if not found:
         raise InputError(path, f"contains no {', '.join(photos.SUFFIXES)} files", REMEDY)

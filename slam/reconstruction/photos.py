@@ -162,7 +162,7 @@ def extract_frames(
     folder.mkdir(parents=True, exist_ok=True)
     photos: list[Photo] = []
     first: float | None = None
-    opened: Any = av.open(str(path))
+    opened: Any = av.open(str(path.absolute()))
     with opened as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
@@ -209,7 +209,7 @@ def stage(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, str]
         target = folder / f"{i:06d}{source.suffix.lower() if readable else '.png'}"
         target.unlink(missing_ok=True)
         if readable:
-            target.symlink_to(source.resolve())
+            file_checks.symlink_or_copy(source, target)
         else:
             image.write(target, image.read_rgb(source))
         staged[photo.name] = target.name

@@ -17,6 +17,7 @@ from scan2sim.pipeline.core.errors import DataError, SettingError, StepError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.photogrammetry import colmap as model_io
 from scan2sim.slam.reconstruction import colmap
 from scan2sim.slam.reconstruction import photos as photos_io
@@ -107,7 +108,7 @@ def reconstruct(inputs: Inputs, params: Reconstructed, out: Path, report: Report
     if not found:
         raise _no_model(source, exhaustive)
     best = found[0]
-    shutil.copytree(best.folder, out / "model")
+    copy_tree(best.folder, out / "model")
     left_out = [photo.name for photo in photos if photo.name not in best.names]
     metrics = {
         "summary": f"COLMAP: {len(best.names)} of {len(photos)} photos, {best.points:,} points, {best.error:.2f} px",

@@ -52,7 +52,8 @@ SCHEMAS: dict[str, Record] = {
         | {"vim_user": _TEXT, "vim_password": _TEXT, "vim_tenant_name": _TEXT},
         **dict.fromkeys(("description", "vim", "datacenter", "schema_type", "schema_version"), _TEXT),
         config={"type": "object"},
-    ),
+    )
+    | {"additionalProperties": False},
     "k8sclusters": _schema(
         {"name": _NAME, "credentials": {"type": "object"}, "vim_account": _UUID, "k8s_version": _TEXT}
         | {"nets": {"type": ["object", "array"], "items": {"type": "object"}}},  # array: the OpenAPI file of Release 8
@@ -60,8 +61,13 @@ SCHEMAS: dict[str, Record] = {
         cni={"type": "array", "items": _TEXT},
     ),
     "k8srepos": _schema(
-        {"name": _NAME, "url": _TEXT, "type": {"enum": ["helm-chart", "juju-bundle"]}}, description=_TEXT
-    ),
+        {"name": _NAME, "url": _TEXT, "type": {"enum": ["helm-chart", "juju-bundle"]}},
+        description=_TEXT,
+        user=_TEXT,
+        password={"type": "string", "minLength": 1, "maxLength": 60},
+        oci={"type": "boolean"},
+    )
+    | {"additionalProperties": False},
     "instance": _schema(
         {"nsName": _TEXT, "nsdId": _UUID, "vimAccountId": _UUID}, nsDescription={"type": ["string", "null"]}
     ),

@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 import scan2sim
+from scan2sim.flows.commands.log import Log
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import execute, run_to_world
 from scan2sim.flows.engine.lock import locked
@@ -116,6 +117,26 @@ def test_digests_are_cached_until_a_file_changes(tmp_path: Path, source: Path) -
     assert Digests(file)(source) == known == digest(source)
     source.write_text("2", encoding="utf-8")
     assert Digests(file)(source) == digest(source) != known
+
+
+def test_digests_notice_a_file_that_was_overwritten_with_its_old_time(tmp_path: Path, source: Path) -> None:
+    before = source.stat()
+    digests = Digests(tmp_path / "digests.json", clock=lambda: before.st_ctime_ns + 10**10)
+    known = digests(source)
+    digests.save()
+    while source.stat().st_ctime_ns == before.st_ctime_ns:  # clocks of disks are coarse
+        source.write_text("2", encoding="utf-8")  # as many bytes
+    os.utime(source, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert Digests(tmp_path / "digests.json")(source) == digest(source) != known
+
+
+def test_digests_of_files_that_may_still_be_written_are_not_kept(tmp_path: Path, source: Path) -> None:
+    written = source.stat().st_ctime_ns
+    for age, kept in ((10**9, 0), (10**10, 1)):
+        digests = Digests(tmp_path / "digests.json", clock=partial(int, written + age))
+        assert digests(source) == digest(source)
+        digests.save()
+        assert len(json.loads((tmp_path / "digests.json").read_text(encoding="utf-8"))) == kept
 
 
 def test_keep_going_runs_all_independent_tasks(tmp_path: Path, source: Path, ran: Callable[[], str]) -> None:
@@ -254,6 +275,15 @@ def test_digest_of_a_folder_covers_names_and_contents(tmp_path: Path) -> None:
     assert digests(folder) == before != digest(tmp_path / "absent")
     (folder / "1.png").rename(folder / "2.png")
     assert digests(folder) == digest(folder) != before
+
+
+def test_file_names_of_another_encoding_have_digests_and_are_logged(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode("straße".encode("latin-1"))
+    folder.mkdir()
+    (folder / folder.name).write_bytes(b"photo")
+    assert digest(folder) != digest(tmp_path) and digest(folder) == Digests(tmp_path / "digests.json")(folder)
+    Log(tmp_path / "run.log").write(f"tile {folder}")
+    assert "stra\\udcdfe" in (tmp_path / "run.log").read_text(encoding="utf-8")
 
 
 def test_deleted_output_is_rebuilt_and_nothing_else(run: Run, ran: Callable[[], str], tmp_path: Path) -> None:
@@ -513,27 +543,52 @@ def test_versions_without_package_metadata(monkeypatch: pytest.MonkeyPatch) -> N
     assert versions.__wrapped__() == {"python": sys.version.split()[0], "scan2sim": scan2sim.__version__}
 
 
-def test_a_script_without_a_guard_of_its_main_part_runs_once(source: Path, tmp_path: Path) -> None:
-    """As `scan2sim.run` is used: processes of steps must not run the script again."""
-    script = tmp_path / "my_script.py"
-    script.write_text(
-        f"""
+SCRIPT = """
+import os, sys
 from pathlib import Path
+
+sys.path[:0] = [{root!r}]
+sys.path.append(Path("no text, so Python skips it"))
+
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import plan
 from scan2sim.pipeline.core.cache import Store
 from tests.flows.toy import chain
 
-folder, store = Path({str(tmp_path)!r}), Store(Path({str(tmp_path)!r}) / "store")
+before = dict(os.environ), sys.warnoptions[:], [*sys.path]
+folder, store = Path({folder!r}), Store(Path({folder!r}) / "store")
 print("runs", flush=True)
-outcome = execute(plan(chain(Path({str(source)!r}), folder / "log"), store), store, jobs=2, on_event=lambda *_: None)
+outcome = execute(plan(chain(Path({source!r}), folder / "log"), store), store, jobs=2, on_event=lambda *_: None)
 outcome.check()
 print("total", outcome.of_tile()["d"].metrics["total"])
-""",
-        encoding="utf-8",
-    )
+print("unchanged" if before == (dict(os.environ), sys.warnoptions, sys.path) else "changed")
+"""
+
+
+def test_a_script_beside_neither_its_packages_nor_its_data(source: Path, tmp_path: Path) -> None:
+    """As `scan2sim.run` is used, without a guard of the main part: steps' processes must not run the script again.
+
+    The script finds the package by `sys.path`, and the folder of the data has a module named as one of Python's own.
+    """
+    data, script = tmp_path / "data", tmp_path / "scripts" / "my_script.py"
+    for folder in (data, script.parent):
+        folder.mkdir()
+    (data / "random.py").write_text("raise SystemExit('shadowed')", encoding="utf-8")
+    text = SCRIPT.format(root=str(ROOT), folder=str(tmp_path), source=str(source))
+    script.write_text(text, encoding="utf-8")
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONSAFEPATH")}
+    done = subprocess.run([sys.executable, script], cwd=data, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["runs", "total", "2", "unchanged"]
+
+
+def test_steps_run_where_the_path_of_the_temporary_folder_is_too_long_for_sockets(source: Path, tmp_path: Path) -> None:
+    folder, script = tmp_path / ("job" * 30), tmp_path / "my_script.py"
+    folder.mkdir()
+    script.write_text(SCRIPT.format(root=str(ROOT), folder=str(tmp_path), source=str(source)), encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)}
+        [sys.executable, script], capture_output=True, text=True, env=os.environ | {"TMPDIR": str(folder)}
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["runs", "total", "2"]
+    assert done.stdout.split() == ["runs", "total", "2", "unchanged"]
+    assert not list(folder.iterdir())

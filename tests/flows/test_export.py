@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+import scan2sim
 from scan2sim.flows.cli import app
 from scan2sim.flows.commands.budget import parse_budget
 from scan2sim.pipeline.core.errors import InputError, SettingError
@@ -34,6 +35,30 @@ def test_export_equals_the_world_of_the_pipeline(tmp_path: Path) -> None:
     run(world, "--to", "gazebo,glb", "--out", tmp_path / "out")
     own = {name: data for name, data in files(world).items() if not name.startswith("scene/")}
     assert files(tmp_path / "out") == own
+
+
+def test_simplified_meshes_need_no_space_in_the_temporary_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = synthetic.world(tmp_path).files["world"]
+    monkeypatch.setattr("tempfile.tempdir", "/nowhere")
+    run(world, "--to", "tiles3d", "--out", tmp_path / "out", "--levels", 2)
+    assert not [name for name in files(tmp_path / "out") if name.startswith(".")]
+
+
+def test_export_in_python_equals_that_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    world = synthetic.world(tmp_path).files["world"]
+    out = scan2sim.export(str(world), "gazebo, glb", str(tmp_path / "python"), progress=False)
+    assert capsys.readouterr().out == ""
+    run(world, "--to", "gazebo,glb", "--out", tmp_path / "command")
+    assert out == tmp_path / "python" and files(out) == files(tmp_path / "command")
+    opened = scan2sim.read_world(world)
+    few = scan2sim.export(opened, ["glb"], tmp_path / "few", budget="triangles=1k", overwrite=True, progress=False)
+    assert (few / "street.glb").is_file() and not (few / "street.sdf").exists()
+    with pytest.raises(SettingError, match=r"export\.page: unknown setting"):
+        scan2sim.export(opened, "glb", tmp_path / "wrong", page="jpeg")
+    with pytest.raises(SettingError, match=r"export\.levels: must be"):
+        scan2sim.export(opened, "glb", tmp_path / "wrong", levels=9)
 
 
 def test_foreign_folders_are_never_overwritten(tmp_path: Path) -> None:

@@ -14,6 +14,9 @@ from typer.testing import CliRunner, Result
 
 from scan2sim.flows.cli import app
 from scan2sim.flows.commands import display
+from scan2sim.flows.engine.planning import plan
+from scan2sim.flows.pipelines.images import Images, build_graph
+from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError, UnavailableError
 from scan2sim.pipeline.core.types import F64, Frame
 from scan2sim.pipeline.io import trajectory as trajectory_io
@@ -96,6 +99,27 @@ def test_without_a_cloud_or_cuda_the_model_is_written_and_a_cloud_asked_for(
     beside = tmp_path / "tile-photos"
     assert len(trajectory_io.read(beside / "trajectory.csv")) == 4
     assert (beside / "colmap" / "points3D.bin").is_file() and not (tmp_path / "tile").exists()
+
+
+def test_photos_in_subfolders_are_read_again_when_they_change(street: tuple[Path, F64], tmp_path: Path) -> None:
+    photos, store = tmp_path / "photos", Store(tmp_path / "store")
+    shutil.copytree(street[0] / "photos", photos / "left")
+    source = Images.model_validate({"photos": photos})
+    before = [item.key for item in plan(build_graph(source, Path()), store)]
+    assert [item.key for item in plan(build_graph(source, Path()), store)] == before
+    shutil.copy(photos / "left" / "01.jpg", photos / "left" / "00.jpg")
+    assert plan(build_graph(source, Path()), store)[0].key != before[0]
+
+
+def test_a_tile_inside_the_folder_of_its_photos_is_refused(street: tuple[Path, F64], tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    shutil.copytree(street[0] / "photos", photos)
+    error = command(photos, "--out", photos / "tile").exception
+    assert isinstance(error, SettingError) and "inside the folder of the photos" in error.cause
+    photos.rename(tmp_path / "street-photos")
+    error = command(tmp_path / "street-photos", "--out", tmp_path / "street").exception
+    assert isinstance(error, SettingError) and "isn't from an earlier run" in error.cause
+    assert [path.name for path in tmp_path.iterdir()] == ["street-photos"]
 
 
 def test_missing_inputs_are_reported_before_anything_is_computed(street: tuple[Path, F64], tmp_path: Path) -> None:

@@ -49,12 +49,20 @@ def test_free_memory_is_that_of_the_machine_and_of_the_container(tmp_path: Path)
     assert free_memory(proc, tmp_path) == pytest.approx(0.8 * 20.48)
     limit.write_text("10000000000\n")
     assert free_memory(proc, tmp_path) == pytest.approx(0.8 * 8)
+    membership, job = tmp_path / "membership", tmp_path / "memory" / "job_7"
+    membership.write_text("4:memory:/job_7\n0::/\n")
+    job.mkdir(parents=True)
+    for name, value in (("limit_in_bytes", 7e9), ("usage_in_bytes", 3e9)):
+        (job / f"memory.{name}").write_text(f"{value:.0f}\n")
+    (job / "memory.stat").write_text("cache 2000000000\ninactive_file 1000000000\n")
+    assert free_memory(proc, tmp_path, membership) == pytest.approx(0.8 * 5), "a job of a cluster"
     limit.write_text("1000000000\n")
     assert free_memory(proc, tmp_path) == 0.25, "a step runs, alone"
     assert free_memory(tmp_path / "none", tmp_path / "none") is None, "unknown: no limit"
 
 
 def test_more_cores_run_more_steps_of_a_survey(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("scan2sim.pipeline.core.cores.cpu_limit", lambda: None)
     for cores, of_one_tile, of_ten in ((1, 2, 2), (4, 2, 2), (6, 3, 3), (16, 3, 8), (64, 3, 30)):
         monkeypatch.setattr("os.sched_getaffinity", lambda _, cores=cores: set(range(cores)))
         assert (default_jobs(), default_jobs(tiles=10)) == (of_one_tile, of_ten)

@@ -10,7 +10,7 @@ import laspy
 import numpy as np
 import pytest
 
-from scan2sim.flows.commands.segment import _write_clouds
+from scan2sim.flows.commands.segment import _write_clouds, short_names
 from scan2sim.pipeline.core.types import Frame, PointCloud, Tile
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
@@ -64,6 +64,14 @@ def test_existing_classes_are_kept(small_street: Path, tmp_path: Path) -> None:
     assert before.classification is not None and after.classification is not None
     np.testing.assert_array_equal(before.classification, after.classification)
     assert not list((tmp_path / "out" / "labels").glob("*.png"))
+
+
+def test_results_of_files_with_the_same_name_have_different_names() -> None:
+    assert short_names(["photos/1.jpg", "photos/2.jpg"]) == ["1", "2"]
+    assert short_names(["photos/IMG.1.jpg", "photos/IMG.2.jpg"]) == ["IMG.1", "IMG.2"]
+    assert short_names(["photos/left/1.jpg", "photos/right/1.jpg"]) == ["photos/left/1", "photos/right/1"]
+    assert short_names(["../a.las", "../b/A.laz"]) == ["a", "b/A"], "file systems may not distinguish a from A"
+    assert short_names(["a.las", "a.laz"]) == ["a.las", "a.laz"]
 
 
 def test_bad_weights_keep_earlier_results(small_street: Path, segmented: tuple[Path, str], tmp_path: Path) -> None:

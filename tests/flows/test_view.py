@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 import urllib.error
 import urllib.request
@@ -120,6 +121,30 @@ def test_server_creates_tiles_on_request_and_rejects_other_hosts(tmp_path: Path)
                 server(pages, served.server_port)
         finally:
             served.shutdown()
+
+
+def test_a_full_disk_and_closed_connections_print_no_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pages = Pages(synthetic.scene(tmp_path), tmp_path / "page", 1.0)
+
+    def refuse(script: str) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pages, "write", refuse)
+    with server(pages, 0) as served:
+        threading.Thread(target=served.serve_forever, daemon=True).start()
+        try:
+            with pytest.raises(urllib.error.HTTPError, match="507"):
+                urllib.request.urlopen(f"http://127.0.0.1:{served.server_port}/tiles/tile0.js")
+            try:
+                raise BrokenPipeError
+            except BrokenPipeError:
+                served.handle_error(None, ("127.0.0.1", 1))  # type: ignore[arg-type]
+        finally:
+            served.shutdown()
+    errors = capsys.readouterr().err
+    assert "no space left on the disk" in errors and "Traceback" not in errors
 
 
 def test_flight_is_a_video_of_the_world(tmp_path: Path) -> None:

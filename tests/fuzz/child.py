@@ -22,7 +22,7 @@ def main() -> None:
     os.dup2(null, 1)
     os.dup2(null, 2)
     resource.setrlimit(resource.RLIMIT_DATA, (MAX_DATA_BYTES, MAX_DATA_BYTES))
-    from scan2sim.flows.cli import replace_unencodable_characters
+    from scan2sim.flows.commands.process import replace_unencodable_characters
     from tests.fuzz.kinds import KINDS
 
     replace_unencodable_characters()

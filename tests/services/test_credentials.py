@@ -1,10 +1,10 @@
-"""Credentials are redacted from URLs of any form; text without credentials is unchanged."""
+"""Credentials are redacted from URLs of any form, and from answers that quote them; other text is unchanged."""
 
 from __future__ import annotations
 
 import pytest
 
-from scan2sim.services.credentials import redacted
+from scan2sim.services.credentials import is_secret, redacted, secrets_of, without
 
 CAMERA = "rtsp://***@camera.example:554/live"
 
@@ -51,3 +51,31 @@ def test_credentials_are_redacted(text: str, expected: str) -> None:
 )  # fmt: skip
 def test_text_without_credentials_is_unchanged(text: str) -> None:
     assert redacted(text) == text
+
+
+def test_credentials_of_a_request_are_found_by_their_names() -> None:
+    body = {
+        "name": "core-site",
+        "vim_password": "hunter2",
+        "config": {"keypair": "laptop", "insecure": True, "token": "abc", "security_groups": ["default"]},
+        "credentials": {"users": [{"user": {"client-key-data": "LS0t", "token": "hush"}}], "kind": "Config"},
+    }
+    assert set(secrets_of(body)) == {"hunter2", "LS0t", "hush"}  # "abc" is too short to be found in a message
+    assert list(secrets_of(None)) == list(secrets_of(b"hunter2")) == []
+
+
+@pytest.mark.parametrize("name", ["password", "os_passwd", "client_secret", "api_key", "APIKEY", "auth-token"])
+def test_names_of_credentials(name: str) -> None:
+    assert is_secret(name)
+
+
+@pytest.mark.parametrize("name", ["keypair", "key_name", "security_groups", "keystone_region", "bypass_proxy", "user"])
+def test_names_of_other_settings(name: str) -> None:
+    assert not is_secret(name)
+
+
+def test_quoted_credentials_are_redacted() -> None:
+    secrets = ["hunter2", "hunter2-and-more", "it's \\ odd"]
+    for secret in secrets:
+        assert without(f"{secret!r} is too long", secrets) in ("'***' is too long", '"***" is too long')
+    assert without("the name is too long", secrets) == "the name is too long"

@@ -23,6 +23,7 @@ from scan2sim.flows.pipelines.video import Video, build_graph
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import InputError, LowConfidenceError, ScanError, exit_code
 from scan2sim.pipeline.io import trajectory as trajectory_io
+from scan2sim.pipeline.io.images.video import Encoder
 from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.odometry.video_odometry import VERSION, track
 from scan2sim.slam.steps.track import TRACK, TrackParams, tracker_of
@@ -238,6 +239,15 @@ def test_truncated_video_is_read_up_to_its_end(corridor: Drive, tmp_path: Path) 
     frames = len(list(open_video(half).frames()))
     assert 5 < frames < len(corridor.greys)
     shutil.rmtree(tmp_path, ignore_errors=True)
+
+
+def test_a_video_may_have_a_name_that_looks_like_an_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("2024-05-01T12:30:00.mp4")
+    with Encoder(path, (64, 48), 10, preset="ultrafast", crf="23") as encoder:
+        for i in range(3):
+            encoder.add(np.full((72, 64), 60 * i, np.uint8), i / 10)
+    assert path.is_file() and len(list(open_video(path).frames())) == 3
 
 
 def test_frames_out_of_order_are_skipped_and_reported(corridor: Drive, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from scan2sim.pipeline.core.step import Done, silent
 from scan2sim.pipeline.core.types import Camera, Frame, Mesh, View
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.texturing import texture_layout
-from scan2sim.texturing.atlas import Backend, manifold
+from scan2sim.texturing.atlas import Backend, Unwrapped, manifold
 from scan2sim.texturing.texture_layout import UnwrapParams
 from scan2sim.texturing.unwrap import UNWRAP, unwrap
 from scan2sim.texturing.view_selection.choice import Choice
@@ -103,12 +103,12 @@ def test_manifold_leaves_at_most_two_faces_per_edge() -> None:
 
 
 def test_failed_blocks_use_the_fallback_backend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = texture_layout._unwrap_in_child
+    real = texture_layout._in_child
 
-    def refuse(mesh: Mesh, blocks: list[npt.NDArray[np.int64]], backend: Backend, params: UnwrapParams) -> list[Any]:
-        return ["refused"] * len(blocks) if backend == "uvatlas" else real(mesh, blocks, backend, params)
+    def refuse(mesh: Mesh, block: npt.NDArray[np.int64], backend: Backend, params: UnwrapParams) -> Unwrapped | str:
+        return "refused" if backend == "uvatlas" else real(mesh, block, backend, params)
 
-    monkeypatch.setattr(texture_layout, "_unwrap_in_child", refuse)
+    monkeypatch.setattr(texture_layout, "_in_child", refuse)
     _, _, done = run(hills(), tmp_path, backend="uvatlas", texel=0.02)
     assert done.metrics["fallbacks"] == 1
     assert "xatlas" in done.warnings[0]

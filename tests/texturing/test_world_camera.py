@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -71,6 +72,52 @@ def test_other_cameras_see_the_same(town: Scene, camera: Camera) -> None:
     narrow, wide = world.render(POSE, CAMERA), world.render(POSE, camera)
     ahead = wide.rgb[camera.height // 2, camera.width // 2].astype(int)
     assert np.abs(ahead - narrow.rgb[60, 80]).max() < 25
+
+
+@pytest.mark.parametrize("given", [[-0.1, 0.01, 0.0, 0.0], np.array([[-0.1, 0.01, 0.0, 0.0]])])
+def test_distortion_may_be_a_list_or_an_array_of_opencv(town: Scene, given: Any) -> None:
+    green_ground().save(town.tiles[0].folder / SPLATS_FILE)
+    lens, exact = (replace(CAMERA, model="opencv", distortion=one) for one in (given, (-0.1, 0.01, 0.0, 0.0)))
+    assert lens == exact and hash(lens) == hash(exact)
+    assert np.array_equal(WorldCamera(town).render(POSE, lens).rgb, WorldCamera(town).render(POSE, exact).rgb)
+
+
+@pytest.mark.parametrize("wrong", [POSE[:3], np.full((4, 4), np.nan), POSE[:3, 3]])
+def test_what_is_no_pose_is_rejected(town: Scene, wrong: np.ndarray) -> None:
+    for view in (WorldCamera(town).render, WorldCamera(town).colours):
+        with pytest.raises(scan2sim.SettingError, match="T_world_cam: is no pose"):
+            view(wrong, CAMERA)
+    assert np.array_equal(
+        WorldCamera(town).render(POSE.tolist(), CAMERA).rgb, WorldCamera(town).render(POSE, CAMERA).rgb
+    )
+
+
+@pytest.mark.parametrize(
+    ("lens", "problem"),
+    [
+        (Camera("pinhole", 64, 48), "no focal length"),
+        (Camera("pinhole", 64, 0, 50, 50), "64 x 0 pixels"),
+        (replace(CAMERA, model=cast(Any, "pin-hole")), "unknown model 'pin-hole'"),
+    ],
+)
+def test_a_camera_that_sees_nothing_is_rejected(town: Scene, lens: Camera, problem: str) -> None:
+    for view in (WorldCamera(town).render, WorldCamera(town).colours):
+        with pytest.raises(scan2sim.SettingError, match=problem):
+            view(POSE, lens)
+
+
+def test_views_elsewhere_continue_after_a_tile_that_cannot_be_read(town: Scene) -> None:
+    green_ground().save(town.tiles[0].folder / SPLATS_FILE)
+    mesh = town.tiles[1].folder / "terrain" / "mesh.npz"
+    content = mesh.read_bytes()[:1000]
+    mesh.unlink()  # its bytes are shared with another folder
+    mesh.write_bytes(content)
+    world = WorldCamera(town, farthest=5.0)
+    before = world.render(view_of_tile(town, 0), CAMERA).rgb
+    for _ in range(2):
+        with pytest.raises(scan2sim.InputError, match="terrain: can't be read"):
+            world.render(view_of_tile(town, 1), CAMERA)
+        assert np.array_equal(world.render(view_of_tile(town, 0), CAMERA).rgb, before)
 
 
 def test_tiles_of_a_survey_are_in_place(town: Scene) -> None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import struct
+import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import unquote
 
-from scan2sim.pipeline.core.errors import InputError, from_os_error
+from scan2sim.pipeline.core.errors import InputError, SpaceError, from_os_error
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.io import file_checks
 
@@ -157,10 +160,13 @@ def opened(path: Path) -> Iterator[Bag]:
 
     Raises:
         InputError: it isn't one, or is damaged. DataError is left to the callers: an empty bag opens.
+        SpaceError: the folder for temporary files has no space for the content of a compressed bag.
         UnavailableError: the package `rosbags` isn't installed.
     """
     require("ROS bags", "rosbags", extra="bag")
     paths = _paths(path)
+    for one in paths:
+        _check_name(one)
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -169,6 +175,9 @@ def opened(path: Path) -> Iterator[Bag]:
         reader.open()
         bag = _described(path, reader)
     except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            cause = f"has no space for {path.name}, which is compressed and is unpacked there"
+            raise SpaceError(tempfile.gettempdir(), cause, "Set TMPDIR to a folder on a larger disk") from None
         raise from_os_error(error, path) from None
     except Exception as error:  # any exception of SQLite, YAML and the library's parsers
         raise InputError(path, f"is not a readable bag ({_text(error)})", _repair(path)) from None
@@ -191,7 +200,7 @@ def _described(path: Path, reader: Any) -> Bag:
 
 def _files(folder: Path) -> list[Path]:
     """Files of a bag in a folder: those of the suffix that comes first in `SUFFIXES`."""
-    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
+    found = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in SUFFIXES and not file_checks.hidden(p)]
     return [p for p in found if p.suffix == found[0].suffix]
 
 
@@ -211,6 +220,15 @@ def _paths(path: Path) -> list[Path]:
     if path.stat().st_size == 0:
         raise InputError(path, "is an empty file", _repair(path))
     return [path]
+
+
+def _check_name(path: Path) -> None:
+    """Check that SQLite, to which the library passes the path as a URI, finds the file."""
+    files = path.glob("*.db3") if path.is_dir() else [path] if path.suffix == ".db3" else []
+    for file in files:
+        if unquote(str(file)) != str(file) or any(c in str(file) for c in "?#"):
+            cause = "has `?`, `#` or a code such as `%20` in its path"
+            raise InputError(file, cause, "Rename it, or link to its folder")
 
 
 def _repair(path: Path) -> str:

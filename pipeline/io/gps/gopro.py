@@ -172,7 +172,7 @@ def _packets(path: Path) -> Iterator[tuple[float, float, bytes]]:
     import av
 
     try:
-        with av.open(str(path)) as video:
+        with av.open(str(path.absolute())) as video:
             tracks = [stream for stream in video.streams if stream.type == "data"]
             for packet in video.demux(tracks) if tracks else ():
                 data = bytes(packet)

@@ -66,7 +66,7 @@ class Encoder:
 
         self.count, self.file, self._last = 0, file, -1
         try:
-            self._container: Any = av.open(str(file), "w", format="mp4", options=container or {})
+            self._container: Any = av.open(str(file.absolute()), "w", format="mp4", options=container or {})
         except OSError as error:
             raise from_os_error(error, file) from error
         stream: Any = self._container.add_stream(CODEC, rate=Fraction(fps).limit_denominator(1001))

@@ -25,7 +25,7 @@ from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import Mesh
 from scan2sim.pipeline.geometry.open_backs import open_backs
 from scan2sim.pipeline.io import robot_formats
-from scan2sim.pipeline.io.file_checks import make_folder
+from scan2sim.pipeline.io.file_checks import copy_tree, make_folder
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.mesh_formats import PageNames, obj
 from scan2sim.pipeline.io.navigation import ros_launch
@@ -188,7 +188,7 @@ def optional_part(name: str, folder: Path, failed: dict[str, ScanError] | None) 
     try:
         make_folder(temporary)
         yield temporary
-        shutil.copytree(temporary, folder, dirs_exist_ok=True, copy_function=os.replace)
+        copy_tree(temporary, folder, os.replace)
     except Exception as error:
         failed[name] = from_exception(error, name, folder)
         if isinstance(failed[name], SpaceError):

@@ -20,6 +20,7 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError, InputError, ScanError, from_os_error
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import world_formats
+from scan2sim.pipeline.io.file_checks import copy_tree, copy_with_time
 from scan2sim.pipeline.io.geodata import crs
 from scan2sim.pipeline.io.world_formats import SceneParams, gazebo, opendrive, optional_part
 from scan2sim.pipeline.io.worlds import readme, scene, sdf
@@ -148,7 +149,7 @@ def link(source: str, target: str) -> None:
             raise OSError("users edit this file")
         os.link(source, target)
     except OSError:
-        shutil.copy2(source, target)
+        copy_with_time(Path(source), Path(target))
 
 
 def same_file(source: Path, copy: Path) -> bool:
@@ -266,7 +267,7 @@ def _write(
     placed = [_place(tile, metadata[tile.name], origin) for tile in tiles]
     for tile in tiles:
         for subfolder in (Path("models") / tile.name, Path(scene.SCENE_FOLDER) / tile.name):
-            shutil.copytree(tile.world / subfolder, folder / subfolder, copy_function=link)
+            copy_tree(tile.world / subfolder, folder / subfolder, link)
     scene.write_scene_file(folder, name, Frame(first.crs, origin, first.unit), [tile.name for tile in tiles])
     whole, sky = scene.read_scene(folder), dict[str, int]()
     with optional_part("sky_dome", folder, failed):

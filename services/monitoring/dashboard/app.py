@@ -56,6 +56,13 @@ class AlarmTarget(Body):
     seconds: Annotated[float, Field(ge=0, le=MAX_WINDOW_S)] = 3600.0
 
 
+class NodeToRetire(Body):
+    """A node that is gone for good, and who says so."""
+
+    node: Subject
+    by: Annotated[str, Field(min_length=1, max_length=100)]
+
+
 class TopicReader:
     """Reads a Kafka topic in a background thread."""
 
@@ -127,7 +134,8 @@ class Sources:
     def of(cls, params: PageParams) -> Sources:
         """Create them empty; `start` starts the readers."""
         now, cluster = time.time(), kafka.Cluster.read(params.kafka_bootstrap_servers, params.kafka_config)
-        history, bus_state = History(now), BusState(now)
+        history = History(now)
+        bus_state = BusState(now, history.retire)
         back, events_back = params.back, max(MIN_EVENT_HISTORY_S, params.back)
         records = TopicReader(cluster, params.topic, back, history.add, history.rejections)
         events = TopicReader(cluster, params.events_topic, events_back, bus_state.add, bus_state.rejections)
@@ -177,6 +185,16 @@ def application(params: PageParams, sources: Sources) -> FastAPI:
             **sources.bus_state.state(now),
         }
 
+    def send(command: AlarmCommand) -> dict[str, str]:
+        """Send a command to the alarm node, and to all pages; returns when Kafka has taken it."""
+        if params.is_open():
+            raise HTTPException(403, "alarms are handled only with a token: start the page with --token FILE")
+        cluster = kafka.Cluster.read(params.kafka_bootstrap_servers, params.kafka_config)
+        if not alarm_commands.send_by_kafka(cluster, params.events_topic, command):
+            cause = f"Kafka at {params.kafka_bootstrap_servers} doesn't take the command"
+            raise UnavailableError(command.subject, cause, "Try again when the page is live")
+        return {"sent": command.action}
+
     @app.get("/", include_in_schema=False)
     def page() -> FileResponse:
         return FileResponse(factory.PAGES / "bus.html")
@@ -211,15 +229,13 @@ def application(params: PageParams, sources: Sources) -> FastAPI:
     @app.post("/api/alarms/{action}")
     def command(action: Literal["acknowledge", "mute"], given: AlarmTarget) -> dict[str, str]:
         """Send a command about an alarm to the alarm node; answers when Kafka has taken it."""
-        if params.is_open():
-            raise HTTPException(403, "alarms are handled only with a token: start the page with --token FILE")
         until = time.time() + given.seconds if action == "mute" else 0.0
-        order = AlarmCommand(action=action, rule=given.rule, subject=given.subject, by=given.by, until=until)
-        cluster = kafka.Cluster.read(params.kafka_bootstrap_servers, params.kafka_config)
-        if not alarm_commands.send_by_kafka(cluster, params.events_topic, order):
-            cause = f"Kafka at {params.kafka_bootstrap_servers} doesn't take the command"
-            raise UnavailableError(given.rule, cause, "Try again when the page is live")
-        return {"sent": action}
+        return send(AlarmCommand(action=action, rule=given.rule, subject=given.subject, by=given.by, until=until))
+
+    @app.post("/api/nodes/retire")
+    def retire(given: NodeToRetire) -> dict[str, str]:
+        """Retire a node: its alarms end, and it isn't listed until it reports again; answers like alarms' commands."""
+        return send(AlarmCommand(action="retire", subject=given.node, by=given.by))
 
     return app
 

@@ -25,6 +25,8 @@ from scan2sim.services.monitoring.record import Record, TopicFlow
 MAX_RECORDS_PER_NODE = 21_600
 """Records of a node that are kept; up to a quarter more before the oldest are dropped."""
 MAX_NODES = 128
+MAX_RETIRED = 1024
+"""Retired nodes that are remembered; the earliest are forgotten."""
 MAX_RECORDS_PER_FLOW = 3600
 """The same of a topic at a node in one direction: one hour at one per second."""
 MAX_FLOWS = 256
@@ -132,6 +134,7 @@ class History:
         self._began, self._lock = began, threading.Lock()
         self._nodes: dict[str, _Node] = {}
         self._flows: dict[tuple[str, str, str], _Series] = {}
+        self._retired: dict[str, float] = {}
         self._numbered, self._topics_numbered = 0, 0
         self.shown, self.rejections = 0, Rejections("records")
 
@@ -153,6 +156,21 @@ class History:
             self.rejections.add(error)
         else:
             self.shown += 1
+
+    def retire(self, node: str, at: float) -> None:
+        """No longer list a node that is gone, until it reports again; its records stay in windows of the past.
+
+        Args:
+            node: full name.
+            at: when it was retired, seconds since the epoch.
+        """
+        with self._lock:
+            self._retired[printable(node)[:MAX_NAME_CHARS]] = at
+            while len(self._retired) > MAX_RETIRED:
+                del self._retired[min(self._retired, key=lambda name: self._retired[name])]
+
+    def _is_listed(self, name: str, node: _Node, now: float) -> bool:
+        return not node.is_gone(now) or node.last.time + node.skew.behind > self._retired.get(name, 0.0)
 
     def _node(self, record: Record) -> _Node:
         name, now = full_name(record), time.monotonic()
@@ -236,11 +254,13 @@ class History:
     def state(self) -> dict[str, Any]:
         """JSON-serializable current state of the nodes and topics, their warnings, and counts of rejected records.
 
+        Nodes are those that aren't retired (`retire`).
         Topics have the `number` of their line in plots; null: beyond `MAX_FLOWS`, it isn't plotted.
         """
         now = time.monotonic()
         with self._lock:
-            nodes = [_state(name, node, now) for name, node in self._nodes.items()]
+            listed = [(name, node) for name, node in self._nodes.items() if self._is_listed(name, node, now)]
+            nodes = [_state(name, node, now) for name, node in listed]
             alive = [node.last for node in self._nodes.values() if not node.is_gone(now)]
             numbers = {printable(key[1])[:MAX_NAME_CHARS]: flow.number for key, flow in self._flows.items()}
         counts = {"counts": {"shown": self.shown, **self.rejections.counts}, "last_rejected": self.rejections.last}

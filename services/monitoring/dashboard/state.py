@@ -1,8 +1,9 @@
-"""State of the bus as derived from its events: runs, queues and alarms; invalid events are counted."""
+"""State of the bus as derived from its events: runs, queues, alarms, retired nodes; invalid events are counted."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 from pydantic import ValidationError
@@ -10,7 +11,15 @@ from pydantic import ValidationError
 from scan2sim.services.monitoring.dashboard.alarms import AlarmStates
 from scan2sim.services.monitoring.dashboard.queues import Queues
 from scan2sim.services.monitoring.dashboard.runs import Runs
-from scan2sim.services.monitoring.events.schema import KINDS, Alarm, Event, QueueState, RunState, StepState
+from scan2sim.services.monitoring.events.schema import (
+    KINDS,
+    Alarm,
+    AlarmCommand,
+    Event,
+    QueueState,
+    RunState,
+    StepState,
+)
 from scan2sim.services.monitoring.messages import MAX_TIME_S, RejectedError, Rejections, first_error, load_json
 
 
@@ -22,9 +31,14 @@ class BusState:
         rejections: rejected events by reason.
     """
 
-    def __init__(self, began: float) -> None:
-        """`began`: start of the dashboard, seconds since the epoch; later events count from their arrival."""
-        self._began = began
+    def __init__(self, began: float, retire: Callable[[str, float], None] = lambda node, at: None) -> None:
+        """Create it empty.
+
+        Args:
+            began: start of the dashboard, seconds since the epoch; later events count from their arrival.
+            retire: called with the full name of each node that is retired, and when.
+        """
+        self._began, self._retire = began, retire
         self.runs, self.queues, self.alarms = Runs(), Queues(), AlarmStates()
         self.rejections = Rejections("events")
 
@@ -39,6 +53,8 @@ class BusState:
                 self.queues.add(content, at)
             elif isinstance(content, Alarm):
                 self.alarms.add(content, at)
+            elif isinstance(content, AlarmCommand) and content.action == "retire":
+                self._retire(content.subject, at)
         except RejectedError as error:
             self.rejections.add(error)
 

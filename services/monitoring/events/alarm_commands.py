@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -23,7 +24,7 @@ TIMEOUT_S = 10.0
 
 def command_of(params: AlarmCommandParams) -> AlarmCommand:
     """The command that a user's parameters mean; without a name, by the user who is logged in."""
-    by = params.by or getpass.getuser()
+    by = params.by or _user()
     if isinstance(params, RetireParams):
         return AlarmCommand(action="retire", subject=params.node, by=by)
     if isinstance(params, MuteParams):
@@ -31,6 +32,14 @@ def command_of(params: AlarmCommandParams) -> AlarmCommand:
         return AlarmCommand(action="mute", rule=params.rule, subject=params.subject, by=by, until=until)
     assert isinstance(params, AcknowledgeParams)
     return AlarmCommand(action="acknowledge", rule=params.rule, subject=params.subject, by=by)
+
+
+def _user() -> str:
+    """Name of the user who is logged in, or its number where it has no name, as in a container."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return f"user {os.getuid()}"
 
 
 def send(params: AlarmCommandParams) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import U8
+from scan2sim.pipeline.io import file_checks
 from scan2sim.services.credentials import redacted
 from scan2sim.services.teleoperation.cameras import CameraFrame, View, frame_times
 
@@ -55,7 +56,8 @@ def _images(view: View) -> Iterator[U8]:
 def _files(folder: Path) -> Iterator[Any]:
     import cv2
 
-    for file in sorted(one for one in folder.iterdir() if one.suffix.lower() in IMAGE_SUFFIXES):
+    images = (one for one in folder.iterdir() if one.suffix.lower() in IMAGE_SUFFIXES and not file_checks.hidden(one))
+    for file in sorted(images):
         image = cv2.imread(str(file))
         if image is None:
             raise InputError(file, "cannot be decoded as an image", "Remove it from the folder")

@@ -29,6 +29,7 @@ class _Driver:
     name: str
     command: Command | None
     last_heard: float
+    acquired: float
 
 
 class DriverSession:
@@ -57,7 +58,8 @@ class DriverSession:
             holder = self._driver
             if holder is not None and holder.name != driver and now - holder.last_heard < LOCK_TIMEOUT_S:
                 raise BusyError("the controls", "are in use on another page", "Release them there first")
-            self._driver, self.release_reason = _Driver(driver, None, now), ""
+            acquired = holder.acquired if holder is not None and holder.name == driver else now
+            self._driver, self.release_reason = _Driver(driver, None, now, acquired), ""
         if holder is None or holder.name != driver:
             self._notify("take control", driver)
 
@@ -104,6 +106,11 @@ class DriverSession:
         """Name of the driver who holds the lock; None: nobody."""
         with self._lock:
             return None if self._driver is None else self._driver.name
+
+    def held(self, now: float) -> tuple[str, float]:
+        """Name of the driver who holds the lock, and for how many seconds; "" and 0: nobody."""
+        with self._lock:
+            return ("", 0.0) if self._driver is None else (self._driver.name, now - self._driver.acquired)
 
     def command(self, now: float) -> Command | None:
         """The command to send now; None: there is none within `COMMAND_TIMEOUT_S`."""

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,25 @@ def verify(path: Path) -> Verification:
         InputError: the file can't be read.
     """
     entries, head, chained, damage = 0, FIRST, False, ""
+    for number, line, entry in _entries(path):
+        chained |= "previous" in entry
+        if chained and entry.get("previous") != head and not damage:
+            damage = f"line {number}: the entry before it was changed or removed, or this one was inserted"
+        entries, head = entries + 1, _digest(line)
+    return Verification(entries, head, damage)
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """All entries of an audit trail, oldest first; lines truncated by a crash are skipped.
+
+    Raises:
+        InputError: the file can't be read.
+    """
+    return [entry for _, _, entry in _entries(path)]
+
+
+def _entries(path: Path) -> Iterator[tuple[int, bytes, dict[str, Any]]]:
+    """Number, text and content of each line that is an entry."""
     try:
         with path.open("rb") as file:
             for number, line in enumerate(file, 1):
@@ -51,15 +71,12 @@ def verify(path: Path) -> Verification:
                     entry = json.loads(line)
                 except ValueError:
                     continue
-                chained |= "previous" in entry
-                if chained and entry.get("previous") != head and not damage:
-                    damage = f"line {number}: the entry before it was changed or removed, or this one was inserted"
-                entries, head = entries + 1, _digest(line)
+                if isinstance(entry, dict):
+                    yield number, line, entry
     except OSError as error:
         raise InputError(
             path, str(error.strerror), "Give the gateway's audit.jsonl, or the folder of --state"
         ) from None
-    return Verification(entries, head, damage)
 
 
 def _digest(line: bytes) -> str:

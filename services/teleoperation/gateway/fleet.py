@@ -68,6 +68,7 @@ class _Party:
     since: float
     status: Status = field(default_factory=Status)
     status_at: float = -math.inf  # when it arrived, seconds of the monotonic clock
+    driver_since: float | None = None  # Unix time at which the driver of a station took control
 
 
 _STATE = TypeAdapter(tuple[int, tuple[Pair, ...]])
@@ -113,6 +114,11 @@ class Fleet:
         """Store a party's status."""
         with self._lock:
             party = self._parties[peer.role, peer.name]
+            before = party.status
+            if not status.driver:
+                party.driver_since = None
+            elif status.driver != before.driver or status.held < before.held:
+                party.driver_since = self._now() - status.held
             party.status, party.status_at = status, time.monotonic()
 
     def handle_request(self, peer: Peer, request: DriverRequest) -> None:
@@ -148,8 +154,8 @@ class Fleet:
         """Unregister a party's connection; its pair stays."""
         with self._lock:
             party = self._parties.get((peer.role, peer.name))
-            if party is not None and party.send is send:
-                party.send, party.since, party.status = None, self._now(), Status()
+            if party is not None and party.send == send:
+                party.send, party.since, party.status, party.driver_since = None, self._now(), Status(), None
 
     # changes of pairs
 
@@ -205,7 +211,10 @@ class Fleet:
     # state for the page
 
     def snapshot(self) -> dict[str, Any]:
-        """All parties and their pairs, for the page and its API."""
+        """All parties and their pairs, for the page and its API.
+
+        `driver` is who has control of a vehicle, or at a station, and `driver_since` since when (Unix time, seconds).
+        """
         with self._lock:
             of_station = {pair.station: pair for pair in self._pairs.values()}
             parties = sorted(self._parties.values(), key=lambda one: one.peer.name)
@@ -213,6 +222,7 @@ class Fleet:
             for one in parties:
                 pairs = self._pairs if one.peer.role == Role.VEHICLE else of_station
                 pair = pairs.get(one.peer.name)
+                station = None if pair is None else self._parties.get((Role.STATION, pair.station))
                 result["vehicles" if one.peer.role == Role.VEHICLE else "stations"].append(
                     {
                         "name": one.peer.name, "connected": one.send is not None, "since": one.since,
@@ -220,7 +230,9 @@ class Fleet:
                         "pair": None if pair is None else pair.number,
                         "other": None if pair is None else pair.station if pairs is self._pairs else pair.vehicle,
                         "before": None if pair is None else pair.before,
-                        **one.status.model_dump(exclude={"kind", "pair", "speed"}),
+                        **one.status.model_dump(exclude={"kind", "pair", "speed", "driver", "held"}),
+                        "driver": "" if station is None else station.status.driver,
+                        "driver_since": None if station is None else station.driver_since,
                     }
                 )  # fmt: skip
             return result

@@ -85,7 +85,7 @@ class Demo:
         self._until("gateway", lambda: self._request("api/fleet") is not None)
         self._run(
             "station", parties / f"station-{STATION_NAME}", gateway, "--listening", f"{LOCALHOST}:{STATION_PORT}",
-            "--port", params.port,
+            "--port", params.port, "--world", params.world,
         )  # fmt: skip
         car = parties / f"vehicle-{VEHICLE_NAME}"
         self._run("adapter", "simulated", "--set", f"world={params.world}", "--key", car / ADAPTER_KEY_FILE)

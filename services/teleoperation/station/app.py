@@ -204,10 +204,13 @@ class Station:
         if joined is None:
             return Status(message=self._why)
         delays = [report.delay for report in joined.reports if report.delay is not None]
+        driver, held = self.driver_session.held(time.monotonic())
         return Status(
             pair=joined.pair,
             links=joined.rates.links(joined.connection),
-            driving=self.driver_session.holder() is not None,
+            driving=bool(driver),
+            driver=driver[:200],
+            held=held,
             message=joined.blocked_by()[:200],
             age=max(delays) if delays else None,
         )

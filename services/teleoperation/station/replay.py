@@ -14,6 +14,7 @@ from fastapi.responses import FileResponse
 
 from scan2sim.services.http import factory
 from scan2sim.services.teleoperation.settings import ReplayParams
+from scan2sim.services.teleoperation.station import road_map
 from scan2sim.services.teleoperation.station.recorder import RecordedFrame, read
 from scan2sim.services.teleoperation.station.web import FRAME_HEADER
 
@@ -25,10 +26,11 @@ def application(params: ReplayParams) -> FastAPI:
     """The driver page with a recorded drive.
 
     Raises:
-        InputError: the recording or the token can't be read.
+        InputError: the recording, the token or the world can't be read.
     """
     next(read(params.recording))  # a missing recording is an error at once
     app = factory.application("Replay", params, alive={}, public=("/",))
+    road_map.add_route(app, () if params.world is None else road_map.read(params.world))
 
     @app.get("/", include_in_schema=False)
     def page() -> FileResponse:

@@ -19,7 +19,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -37,7 +37,7 @@ from scan2sim.services.teleoperation.gateway.client import GatewayConnection
 from scan2sim.services.teleoperation.gateway_protocol import Address, DriverEvent
 from scan2sim.services.teleoperation.identity import Identity, Role
 from scan2sim.services.teleoperation.settings import GATEWAY_PORT, STATION_PORT, StationParams, parse_address
-from scan2sim.services.teleoperation.station import app_window
+from scan2sim.services.teleoperation.station import app_window, road_map
 from scan2sim.services.teleoperation.station.app import Station, send_request
 from scan2sim.services.teleoperation.station.drivers import Driver, DriverRole, Drivers
 from scan2sim.services.teleoperation.station.recorder import Recorder
@@ -184,6 +184,7 @@ def application(
     hub: PageHub,
     request_pair: Callable[[str, str, str], bool],
     drivers: Drivers | None = None,
+    map_lines: Sequence[road_map.MapLine] = (),
 ) -> FastAPI:
     """The driver page and its API.
 
@@ -193,12 +194,14 @@ def application(
         hub: distributes the station's frames.
         request_pair: requests the gateway to join or to release a vehicle for a driver; False: it isn't connected.
         drivers: named drivers, who each have a token; None: anybody with the server's token.
+        map_lines: map of the vehicle's world; empty: none is shown.
 
     Raises:
         InputError: the token can't be read.
     """
     accepts = None if drivers is None else lambda token: drivers.identify(token) is not None
     app = factory.application("Teleoperation", served, alive={"station": station.alive}, public=("/",), accepts=accepts)
+    road_map.add_route(app, map_lines)
 
     @app.get("/", include_in_schema=False)
     def page() -> FileResponse:
@@ -312,11 +315,14 @@ def serve(params: StationParams, notify: Callable[[str], None], window: bool = F
     """Run a station and its page until Ctrl-C; `notify` is called with progress messages; `window`: open a window.
 
     Raises:
-        ScanError: the certificate can't be read, the station can't listen, or no window can be opened.
+        ScanError: the certificate or the world can't be read, the station can't listen, or no window can be opened.
     """
     if window:
         app_window.browser()
     drivers = None if params.drivers is None else Drivers(params.drivers)
+    map_lines = () if params.world is None else road_map.read(params.world)
+    if params.world is not None and not map_lines:
+        notify(f"{params.world} has no roads: the driver page shows no map")
     identity = Identity.read(params.certificates, Role.STATION)
     gateway = parse_address("GATEWAY", params.gateway, GATEWAY_PORT)
     listens = [parse_address("--listening", text, STATION_PORT) for text in params.listening]
@@ -350,7 +356,7 @@ def serve(params: StationParams, notify: Callable[[str], None], window: bool = F
             if window:
                 stack.enter_context(app_window.window(url))
 
-        app = application(params, station, hub, partial(send_request, gateway_connection), drivers)
+        app = application(params, station, hub, partial(send_request, gateway_connection), drivers, map_lines)
         factory.run(app, params, listening)
 
 

@@ -17,6 +17,15 @@ from scan2sim.pipeline.core.remote import CACHE_VARIABLE, Remote, is_remote, loc
 from tests.flows.toy import chain
 
 
+def test_a_user_without_a_cache_folder_is_told_how_to_choose_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "file" / "cache"))
+    with pytest.raises(UnavailableError, match=f"s3://survey/town: can't be copied.*Set {CACHE_VARIABLE}"):
+        Remote.of("s3://survey/town")
+
+
 @pytest.fixture(scope="module")
 def s3() -> Iterator[str]:
     """The URL of an empty bucket."""

@@ -502,7 +502,11 @@ def test_invalid_surveys_are_rejected_with_their_cause(tmp_path: Path) -> None:
             read_survey(out)
     out.write_text(text, encoding="utf-8")
     other = tmp_path / "out/bend_0001/tile.toml"
-    other.write_text(other.read_text(encoding="utf-8").replace("EPSG:32632", "EPSG:32633"), encoding="utf-8")
+    tile = other.read_text(encoding="utf-8")
+    other.write_text(tile.replace('"bend_0001"', '"Bend_0000"'), encoding="utf-8")
+    with pytest.raises(InputError, match="names two tiles Bend_0000"):
+        read_survey(out)
+    other.write_text(tile.replace("EPSG:32632", "EPSG:32633"), encoding="utf-8")
     with pytest.raises(InputError, match=r"two CRS: bend_0001 is in EPSG:32633, bend_0000 in EPSG:32632"):
         read_survey(out)
 

@@ -481,6 +481,32 @@ def test_alarms_are_acknowledged_and_muted_on_the_page(broker: Broker, page: Pag
         page.value("localStorage.clear()")
 
 
+def test_node_that_is_gone_for_good_is_retired_on_the_page(broker: Broker, page: Page) -> None:
+    params = PageParams(kafka_bootstrap_servers=broker.servers, port=0, topic="retired_records", events_topic="retired")
+    TopicProducer(broker.cluster, params.events_topic).send([OutboxRecord(0, f"test:{next(NUMBERS)}", a_queue("q"))])
+    listed = "[...document.querySelectorAll('#gone tbody tr')].map(r => r.cells[0].innerText)"
+    with serve_page(params) as served:
+        for name in ("lost", "past"):
+            served.history.add(record(name, time.time() - 100).json_line().encode())
+        page.do("Page.navigate", url=served.url)
+        page.until("document.readyState === 'complete' && byId('status').textContent === 'live'")
+        page.value("localStorage.clear(); byId('gone').open = true")
+        page.until("document.querySelectorAll('#gone tbody button').length === 2")
+        assert page.value("document.querySelector('#gone tbody button').disabled"), "no name yet"
+        page.value("handling.by.value = 'Ada'; handling.by.dispatchEvent(new Event('input'))")
+        page.until("!document.querySelector('#gone tbody button').disabled")
+        page.click("#gone tbody button")
+        page.until("document.getElementById('answer').innerText.startsWith('Sent to the alarm node: retire /lost')")
+        page.until(f"JSON.stringify({listed}) === '[\"/past\"]'")
+        served.history.add(record("lost", time.time(), period=60.0).json_line().encode())
+        page.until("document.querySelector('#nodes tbody').innerText.includes('/lost')")
+        page.value("localStorage.clear()")
+    bodies = read(broker.cluster, params.events_topic, group="test-retired", since=0, wait=0.5)
+    events = (Event.model_validate_json(one) for one in bodies if one is not None)
+    command = AlarmCommand.model_validate(next(one.body for one in events if one.kind == "alarm_command"))
+    assert (command.action, command.subject, command.by) == ("retire", "/lost", "Ada")
+
+
 def test_alarms_are_not_handled_by_strangers(tmp_path: Path) -> None:
     from starlette.testclient import TestClient
 
@@ -490,6 +516,7 @@ def test_alarms_are_not_handled_by_strangers(tmp_path: Path) -> None:
     client = TestClient(application(params, Sources.of(params)))
     answer = client.post("/api/alarms/mute", json={"rule": "*", "subject": "/camera", "by": "stranger"})
     assert answer.status_code == 403 and "--token" in answer.json()["cause"]
+    assert client.post("/api/nodes/retire", json={"node": "/camera", "by": "stranger"}).status_code == 403
 
 
 def test_details_of_unchanged_runs_are_not_resent() -> None:

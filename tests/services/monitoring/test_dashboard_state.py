@@ -201,3 +201,12 @@ def test_events_before_the_start_keep_their_own_time() -> None:
     bus_state = BusState(NOW)
     bus_state.add(body(time=NOW - 100))
     assert bus_state.state(NOW)["runs"][0]["silent"] and bus_state.state(NOW)["runs"][0]["came"] == NOW - 100
+
+
+def test_retirement_of_nodes_is_passed_on_with_its_time() -> None:
+    retired: list[tuple[str, float]] = []
+    bus_state = BusState(NOW, lambda node, at: retired.append((node, at)))
+    for action in ("acknowledge", "retire"):
+        command = {"action": action, "rule": "*", "subject": "/camera", "by": "Ada", "until": 0.0}
+        bus_state.add(body(kind="alarm_command", body=command, time=NOW - 100))
+    assert retired == [("/camera", NOW - 100)] and not bus_state.rejections.counts

@@ -186,6 +186,32 @@ def test_node_that_ended_before_the_start_is_gone(monkeypatch: pytest.MonkeyPatc
     assert state["nodes"][0]["silent"] == 600
 
 
+def test_retired_node_is_not_listed_until_it_reports_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    of = history_of(body("lost", START), body("other", START))
+    of.retire("/lost", START + 60)
+    assert len(of.state()["nodes"]) == 2, "a node that is alive can't be hidden"
+    now = 1060.0
+    assert [node["name"] for node in of.state()["nodes"]] == ["/other"]
+    assert [node["name"] for node in window(of, 10)["nodes"]] == ["/lost", "/other"], "its past is kept"
+    of.add(body("lost", START + 120))
+    assert [node["name"] for node in of.state()["nodes"]] == ["/lost", "/other"]
+    now = 1120.0
+    assert [node["gone"] for node in of.state()["nodes"]] == [True, True], "it is gone again, but not retired again"
+
+
+def test_number_of_retired_nodes_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_RETIRED", 2)
+    now = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    of = history_of(*(body(name, START) for name in "abc"))
+    now = 1060.0
+    for number, name in enumerate("abc"):
+        of.retire(f"/{name}", START + 60 + number)
+    assert [node["name"] for node in of.state()["nodes"]] == ["/a"], "the first one is forgotten"
+
+
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_RECORDS_PER_NODE", 1000)
     monkeypatch.setattr(module, "MAX_NODES", 3)

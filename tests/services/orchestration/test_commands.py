@@ -128,3 +128,18 @@ def test_the_fake_returns_parameters_like_each_release(fake: FakeOsm, start: Cal
     returned: Any = operation.params.functions
     (function,) = json.loads(returned) if fake.state.as_json else returned
     assert function["additionalParamsForKdu"] == [{"kdu_name": "detect", "additionalParams": VALUES}]
+
+
+def test_lists_are_printed_as_json(fake: FakeOsm, start: Callable[[], str], command: Command, detect: str) -> None:
+    start()
+    found = json.loads(command("list", "--json"))
+    assert {one["kind"] for one in found["packages"]} == {"function", "network service"}
+    (one,) = found["instances"]
+    assert (one["name"], one["network service"], one["state"]) == ("one", detect, "ready")
+    (vim,) = json.loads(command("vim", "list", "--json"))
+    assert (vim["name"], vim["kind"], vim["state"]) == ("edge-site", "openstack", "enabled") and vim[
+        "id"
+    ] in fake.state.vims
+    assert json.loads(command("cluster", "list", "--json"))[0]["name"] == "edge-cluster"
+    for words in (("repo", "list"), ("slice", "list"), ("slice", "templates")):
+        assert json.loads(command(*words, "--json")) == []

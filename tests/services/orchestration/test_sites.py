@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from scan2sim.flows.commands.orchestrate import app
-from scan2sim.pipeline.core.errors import InputError, ScanError
+from scan2sim.pipeline.core.errors import InputError, ScanError, SettingError
 from scan2sim.services.orchestration import sites
 from tests.fakes.osm import FakeOsm
 
@@ -76,6 +78,75 @@ def test_kubeconfigs_that_osm_cannot_use_are_rejected(tmp_path: Path, text: str,
         sites.cluster_request("a", tmp_path / "gone", vim="1", version="1.30", network=None)
 
 
+@pytest.fixture
+def secret(tmp_path: Path) -> Path:
+    """File with a password."""
+    path = tmp_path / "secret"
+    path.write_text("hunter2\n", encoding="utf-8")
+    return path
+
+
+def test_settings_of_a_provider_are_sent(fake: FakeOsm, secret: Path, tmp_path: Path) -> None:
+    config = tmp_path / "vim.yaml"
+    config.write_text("security_groups: [default]\ninsecure: false\nca_password: hush\n", encoding="utf-8")
+    account = ("vim", "add", "core", "http://vim:5000/v3", "--vim-user", "osm", "--vim-password", secret)
+    run(fake, *account, "--config", config, "--set", "insecure=true", "--set", "keypair=laptop")
+    (made,) = (one for one in fake.state.vims.values() if one["name"] == "core")
+    assert made["config"] == {
+        "security_groups": ["default"], "insecure": True, "ca_password": "hush", "keypair": "laptop"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", "just text", "a: [", "when: 2026-01-01", "a: .nan"])
+def test_files_that_are_no_settings_of_a_provider_are_rejected(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "vim.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises((InputError, SettingError)):
+        sites.vim_config(path, {})
+
+
+def test_credentials_of_a_provider_are_not_accepted_on_the_command_line() -> None:
+    with pytest.raises(SettingError, match="nsx_password is a credential") as caught:
+        sites.vim_config(None, {"insecure": True, "nsx_password": "hunter2"})
+    assert "--config" in caught.value.remedy and "hunter2" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("url", "is_oci"), [("https://charts.example.org", False), ("oci://registry/charts", True)])
+def test_a_private_repository_is_registered_with_its_login(fake: FakeOsm, secret: Path, url: str, is_oci: bool) -> None:
+    output = run(fake, "repo", "add", "charts", url, "--repo-user", "robot", "--repo-password", secret, "--wait")
+    (made,) = fake.state.repositories.values()
+    assert (made["user"], made["password"], made.get("oci", False)) == ("robot", "hunter2", is_oci)
+    assert "charts is added" in output and "hunter2" not in output + run(fake, "repo", "list")
+
+
+@pytest.mark.parametrize(
+    ("url", "login", "expected"),
+    [
+        ("https://robot:hunter2@charts.example.org", {}, "contains a login"),
+        ("https://charts.example.org", {"user": "robot"}, "--repo-password"),
+        ("https://charts.example.org", {"password": "hunter2"}, "--repo-user"),
+    ],
+)
+def test_logins_that_are_shown_or_incomplete_are_rejected(url: str, login: dict[str, Any], expected: str) -> None:
+    with pytest.raises(SettingError, match=expected) as caught:
+        sites.repository_request("charts", url, **login)
+    assert "hunter2" not in str(caught.value)
+
+
+def test_passwords_that_osm_quotes_are_redacted(fake: FakeOsm, secret: Path) -> None:
+    secret.write_text(30 * "hunter2", encoding="utf-8")
+    words = ("repo", "add", "charts", "https://charts", "--repo-user", "robot", "--repo-password", secret)
+    with pytest.raises(ScanError, match="too long") as caught:
+        run(fake, *words)
+    assert "***" in caught.value.cause and "hunter" not in str(caught.value)
+
+
+def test_empty_files_of_passwords_are_rejected(secret: Path) -> None:
+    secret.write_text("\n", encoding="utf-8")
+    with pytest.raises(InputError, match="is empty"):
+        sites.read_secret(secret)
+
+
 def test_progress_is_printed_without_a_terminal(fake: FakeOsm, tmp_path: Path) -> None:
     path = tmp_path / "services.toml"
     path.write_text(
@@ -83,3 +154,21 @@ def test_progress_is_printed_without_a_terminal(fake: FakeOsm, tmp_path: Path) -
     )
     lines = run(fake, "apply", path, "--wait").splitlines()
     assert "a: one: create" in lines and "a: one: instantiate" in lines
+
+
+def test_plan_and_apply_print_json_only_on_standard_output(fake: FakeOsm, town: Path) -> None:
+    def as_json(*words: object) -> Any:
+        return json.loads(CliRunner().invoke(app, [*map(str, words), "--json", "--osm", fake.address]).stdout)
+
+    planned = as_json("plan", town)
+    assert {"name": "detect-north", "action": "create", "reason": "not in OSM"} in planned
+    applied = as_json("apply", town, "--wait")
+    assert {one["name"] for one in applied["done"]} == {one["name"] for one in planned} and not applied["failed"]
+    assert as_json("plan", town) == [] and as_json("apply", town) == {"done": [], "failed": {}}
+
+
+def test_failures_of_apply_are_in_its_json(fake: FakeOsm, town: Path) -> None:
+    fake.state.outcome = lambda kind, name: "FAILED" if (kind, name) == ("instantiate", "detect-north") else "COMPLETED"
+    done = CliRunner().invoke(app, ["apply", str(town), "--wait", "--json", "--osm", fake.address])
+    failed = json.loads(done.stdout)["failed"]
+    assert done.exit_code and list(failed) == ["detect-north"] and "no quota" in failed["detect-north"]

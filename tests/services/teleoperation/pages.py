@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
 from scan2sim.services.teleoperation.station.drivers import Drivers
+from scan2sim.services.teleoperation.station.road_map import MapLine
 from scan2sim.services.teleoperation.station.web import PageHub, application
 from tests.fakes.ports import free_port
 from tests.services.teleoperation.street import HERE, Desk, Street
@@ -36,12 +37,14 @@ class Cockpit:
 
 
 @contextmanager
-def served(tmp_path: Path, params: ServerParams, drivers: Drivers | None = None) -> Iterator[Cockpit]:
+def served(
+    tmp_path: Path, params: ServerParams, drivers: Drivers | None = None, map_lines: Sequence[MapLine] = ()
+) -> Iterator[Cockpit]:
     """Serve the page of a street's station."""
     street = Street(tmp_path)
     urls: list[str] = []
     try:
-        cockpit = page_of(street, params, drivers)
+        cockpit = page_of(street, params, drivers, map_lines)
         threading.Thread(target=factory.run, args=(cockpit.app, params, urls.append), daemon=True).start()
         until(lambda: urls)
         cockpit.url = urls[0]
@@ -50,12 +53,14 @@ def served(tmp_path: Path, params: ServerParams, drivers: Drivers | None = None)
         street.close()
 
 
-def page_of(street: Street, params: ServerParams, drivers: Drivers | None = None) -> Cockpit:
+def page_of(
+    street: Street, params: ServerParams, drivers: Drivers | None = None, map_lines: Sequence[MapLine] = ()
+) -> Cockpit:
     desk = street.desk()
     hub = PageHub(lambda frame: joined.age(frame.captured) if (joined := desk.station.joined()) else 0.0)
     desk.show = hub.show
     desk.station.report_event = desk.gateway_connection.report_event
-    app = application(params, desk.station, hub, lambda what, vehicle, driver: True, drivers)
+    app = application(params, desk.station, hub, lambda what, vehicle, driver: True, drivers, map_lines)
     return Cockpit(street, desk, app, hub)
 
 

@@ -58,6 +58,15 @@ def test_images_of_a_folder_are_processed_in_order_and_drawn(engine: Engine, tmp
     assert drawn == ["10.jpg", "20.jpg", "30.jpg"]
 
 
+def test_images_that_cant_be_written_are_an_error(
+    engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Image.fromarray(shaky.image(10)).save(tmp_path / "10.png")
+    monkeypatch.setattr("cv2.imwrite", lambda *_: False)  # a full disk
+    with pytest.raises(OSError, match="No space left"):
+        offline.process_files(engine, tmp_path, tmp_path / "out", silent)
+
+
 def test_video_gives_results_with_time_stamps_and_a_video(engine: Engine, tmp_path: Path) -> None:
     expected = [10 * i for i in range(15)]
     path = film(tmp_path / "video.avi", expected)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sqlite3
 import sys
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial.transform import Rotation
 
-from scan2sim.pipeline.core.errors import DataError, InputError, ScanError, SettingError, UnavailableError
+from scan2sim.pipeline.core.errors import DataError, InputError, ScanError, SettingError, SpaceError, UnavailableError
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers.bag.contents import inspected
 from scan2sim.pipeline.importers.bag.plan import BagParams, described, plan_import
@@ -132,6 +133,26 @@ def stamped(kind: str) -> Callable[[BagFile, int, float], None]:
         bag.write("/pose", f"geometry_msgs/{kind}", time, header=bag.header(time, "map"), pose=body)
 
     return writer
+
+
+@pytest.mark.parametrize("name", ["drive #3", "drive?", "drive%203"])
+def test_paths_that_sqlite_would_read_as_uris_are_reported(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "drive.db3").write_bytes(b"SQLite format 3\0")
+    for path in (tmp_path / name, tmp_path / name / "drive.db3"):
+        with pytest.raises(InputError, match="in its path. Rename it"), opened(path):
+            pass
+
+
+def test_a_compressed_bag_that_is_larger_than_the_temporary_folder_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unpack_to_full_disk(reader: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("rosbags.highlevel.AnyReader.open", unpack_to_full_disk)
+    with pytest.raises(SpaceError, match="Set TMPDIR"), opened(write(bag_path(tmp_path, "mcap"))):
+        pass
 
 
 @pytest.mark.parametrize("form", FORMATS)

@@ -52,6 +52,19 @@ def test_only_one_driver_holds_the_lock() -> None:
     )
 
 
+def test_session_reports_who_holds_the_lock_and_for_how_long() -> None:
+    session = DriverSession()
+    assert session.held(5.0) == ("", 0.0)
+    session.acquire("anna", 5.0)
+    session.update("anna", AHEAD, 7.0)
+    session.acquire("anna", 8.0)  # pressed again
+    assert session.held(9.0) == ("anna", 4.0)
+    session.acquire("ben", 7.0 + LOCK_TIMEOUT_S + 2.0)
+    assert session.held(16.0) == ("ben", 2.0)
+    session.release("ben", "the page was closed")
+    assert session.held(17.0) == ("", 0.0)
+
+
 def test_emergency_stop_replaces_commands_until_its_driver_ends_it() -> None:
     session = DriverSession()
     session.acquire("page 1", 0.0)

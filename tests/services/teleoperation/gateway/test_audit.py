@@ -51,6 +51,17 @@ def test_changed_removed_and_inserted_entries_are_found(path: Path, at: int) -> 
         assert done.exit_code != 0
 
 
+def test_trail_is_printed_as_json_also_if_it_was_changed(path: Path) -> None:
+    done = CliRunner().invoke(app, ["teleop", "audit", str(path), "--json"])
+    found = json.loads(done.stdout)
+    assert done.exit_code == 0 and (found["entries"], found["damage"]) == (5, "") and found["head"] == verify(path).head
+    assert [(one["time"], one["by"]) for one in found["trail"]] == [(number, "anna") for number in range(5)]
+    path.write_text(path.read_text(encoding="utf-8").replace("anna", "nobody", 1) + "5\n{broken", encoding="utf-8")
+    done = CliRunner().invoke(app, ["teleop", "audit", str(path), "--json"])
+    found = json.loads(done.stdout)
+    assert done.exit_code != 0 and found["damage"].startswith("line 2") and len(found["trail"]) == 5
+
+
 def test_removed_last_entry_changes_the_head(path: Path) -> None:
     head = verify(path).head
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:-1]))

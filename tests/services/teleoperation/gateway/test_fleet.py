@@ -189,3 +189,34 @@ def test_random_requests_never_put_a_party_into_two_pairs(tmp_path: Path) -> Non
         for car in cars:
             own_pair = next((pair for pair, (name, _) in pairs.items() if name == car.peer.name), None)
             assert car.pair() == own_pair
+
+
+def test_fleet_knows_who_drives_and_since_when(tmp_path: Path) -> None:
+    now = [1000.0]
+    fleet = Fleet(tmp_path, now=lambda: now[0])
+    _, desk, _ = connected_parties(fleet)
+    fleet.join("car", "desk", "operator")
+
+    def drivers() -> list[tuple[str, float | None]]:
+        state = fleet.snapshot()
+        vehicle, station = state["vehicles"][0], next(one for one in state["stations"] if one["name"] == "desk")
+        assert "held" not in vehicle
+        return [(one["driver"], one["driver_since"]) for one in (vehicle, station)]
+
+    def report(driver: str, held: float) -> None:
+        fleet.update_status(desk.peer, Status(pair=1, driver=driver, held=held))
+
+    assert drivers() == [("", None), ("", None)]
+    report("anna", 20.0)  # the gateway was restarted while she drove
+    now[0] += 5.0
+    report("anna", 25.0)
+    assert drivers() == [("anna", 980.0), ("anna", 980.0)]
+    report("anna", 1.0)  # she released control, and took it again
+    assert drivers()[0] == ("anna", 1004.0)
+    report("ben", 2.0)
+    assert drivers()[0] == ("ben", 1003.0)
+    report("", 0.0)
+    assert drivers() == [("", None), ("", None)]
+    report("ben", 1.0)
+    fleet.disconnected(desk.peer, desk.send)
+    assert drivers()[0] == ("", None)

@@ -81,6 +81,9 @@ def test_page_lists_parties_and_joins_them(tmp_path: Path, page: Page) -> None:
     assert "84 ms 1.0 % lost" in text and "wifi down" in text and HOSTILE in text
     assert page.value("document.title") == "Fleet · scan2sim" and not page.errors
     assert fleet.snapshot()["vehicles"][0]["other"] == "desk"
+    fleet.update_status(Peer(Role.STATION, "desk", "0" * 64), Status(pair=1, driver="anna (page 3)", held=60.0))
+    for place, text in (("vehicles", "driven from desk"), ("stations", "drives car")):
+        page.until(f"document.querySelector('#{place}').textContent.includes('{text} by anna (page 3) since ')")
 
 
 def test_speeds_disappear_when_a_vehicle_falls_silent(tmp_path: Path, page: Page) -> None:

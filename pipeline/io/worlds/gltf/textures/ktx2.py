@@ -46,7 +46,7 @@ def encode(page: U8, quality: int) -> bytes:
             ]
         else:
             command = ["toktx", "--encode", "etc1s", "--genmipmap", "--qlevel", quality_255, str(target), str(source)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S)
         if done.returncode or not target.is_file():
             output = (done.stderr or done.stdout).strip().splitlines()[-1:]
             raise UnavailableError(command[0], f"failed: {' '.join(output)}", "Choose export.glb_texture=webp or jpeg")

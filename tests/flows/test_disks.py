@@ -1,0 +1,87 @@
+"""Disks as strangers have them: exFAT without links and permissions, network drives without locks."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scan2sim.flows.commands.drive import _link
+from scan2sim.flows.engine.lock import locked
+from scan2sim.pipeline.core.errors import BusyError, UnavailableError
+from scan2sim.pipeline.io.file_checks import copy_tree
+from scan2sim.pipeline.io.worlds.merge import link
+from tests.flows.inline_steps import inline_steps
+from tests.flows.tiny import COARSE, tiny
+from tests.flows.tiny import scan2sim as run_scan2sim
+
+
+def refuse(code: int) -> Callable[..., Any]:
+    """A function of the operating system that always fails."""
+
+    def refused(*arguments: Any, **options: Any) -> None:
+        raise OSError(code, os.strerror(code))
+
+    return refused
+
+
+@pytest.fixture
+def tile(small_street: Path, tmp_path: Path) -> Path:
+    return tiny(small_street, tmp_path / "tile", photo_scale=0.5, truth=False)
+
+
+@pytest.fixture
+def exfat(monkeypatch: pytest.MonkeyPatch) -> None:
+    for owner, name in ((os, "link"), (os, "symlink"), (os, "chmod")):
+        monkeypatch.setattr(owner, name, refuse(errno.EPERM))
+
+
+def test_a_world_is_built_on_a_disk_without_links(tile: Path, tmp_path: Path, exfat: None) -> None:
+    out = tmp_path / "out"
+    for reused in (False, True):
+        with inline_steps():
+            code, text = run_scan2sim("run", tile, "--out", out, settings=COARSE)
+        assert code == 0, text
+        assert ("nothing to do" in text) == reused, text
+    assert (out / "world" / "street.sdf").is_file()
+    photos = list((out / "steps" / "views").glob("*/views/photos/*"))
+    assert photos and not any(photo.is_symlink() for photo in photos)
+
+
+def test_folders_are_copied_to_a_disk_that_refuses_times(
+    tmp_path: Path, exfat: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "utime", refuse(errno.EPERM))
+    (tmp_path / "made" / "meshes").mkdir(parents=True)
+    (tmp_path / "made" / "meshes" / "ground.glb").write_bytes(b"mesh")
+    for _ in range(2):  # the second time into the folder of the first one
+        copy_tree(tmp_path / "made", tmp_path / "world", link)
+    assert (tmp_path / "world" / "meshes" / "ground.glb").read_bytes() == b"mesh"
+
+
+def test_results_of_a_drive_are_named_where_they_cant_be_linked(tmp_path: Path, exfat: None) -> None:
+    (tmp_path / "steps" / "corridor").mkdir(parents=True)
+    _link(tmp_path / "steps" / "corridor", tmp_path / "corridor")
+    assert (tmp_path / "corridor.txt").read_text(encoding="utf-8") == "steps/corridor\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "error", "text"),
+    [
+        (errno.EWOULDBLOCK, BusyError, "another run is using this folder"),
+        (errno.EACCES, BusyError, "another run is using this folder"),
+        (errno.ENOLCK, UnavailableError, "can't be locked on this disk"),
+        (errno.ENOSYS, UnavailableError, "can't be locked on this disk"),
+    ],
+)
+def test_locks_of_network_drives(
+    code: int, error: type[Exception], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fcntl, "flock", refuse(code))
+    with pytest.raises(error, match=text), locked(tmp_path / "out"):
+        pass
