@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from scan2sim.pipeline.camera import panorama
 from scan2sim.pipeline.core.errors import DataError, InputError, UnavailableError
-from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images import exif, image
+from scan2sim.slam.video import Video, decode, upright
 
 COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 """Suffixes of photos that COLMAP reads; others are converted for it."""
@@ -134,60 +135,59 @@ def with_times(photos: Sequence[Photo], names: Sequence[str], path: Path) -> lis
 
 
 def extract_frames(
-    path: Path,
-    folder: Path,
-    fps: float,
-    until: float,
-    focal_35mm: float | None,
-    report: Report,
-    warn: Callable[[str], None],
+    video: Video, folder: Path, fps: float, until: float, report: Report, warn: Callable[[str], None]
 ) -> list[Photo]:
-    """Write frames of a video as JPEG files into `folder`.
+    """Write frames of a video file as JPEG files into `folder`.
 
     Args:
-        path: video file.
+        video: the video.
         folder: folder to create.
         fps: frames per second of the video to extract.
         until: end of the part to extract, seconds; 0: all of it.
-        focal_35mm: 35 mm equivalent focal length by the video's metadata.
         report: receives progress.
         warn: receives a warning if the video is damaged.
 
     Raises:
-        InputError: it has no readable frame. DataError: fewer than `MIN_PHOTOS`. UnavailableError: PyAV is missing.
+        DataError: fewer than `MIN_PHOTOS`.
     """
-    require("a video", "av")
-    import av
-
     folder.mkdir(parents=True, exist_ok=True)
     photos: list[Photo] = []
-    first: float | None = None
-    opened: Any = av.open(str(path.absolute()))
-    with opened as container:
-        stream = container.streams.video[0]
-        stream.thread_type = "AUTO"
-        length = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
-        try:
-            for frame in container.decode(stream):
-                if frame.pts is None:
-                    continue
-                time = float(frame.pts * frame.time_base)
-                first = time if first is None else first
-                time -= first
-                if until and time > until:
-                    break
-                if photos and time < (photos[0].time or 0) + len(photos) / fps - 1e-6:
-                    continue
-                report(min(time / length, 1.0) if length else 0.5, f"frame at {time:.1f} s")
-                name = f"{len(photos):06d}.jpg"
-                image.write(folder / name, np.asarray(frame.to_ndarray(format="rgb24"), np.uint8), quality=JPEG_QUALITY)
-                size = (frame.width, frame.height)
-                focal = None if focal_35mm is None else focal_35mm / FILM_DIAGONAL_MM * math.hypot(*size)
-                photos.append(Photo(name, *size, focal, time))
-        except av.error.FFmpegError as error:
-            warn(f"the video can't be read beyond {photos[-1].time if photos else 0:.1f} s ({error})")
-    check_count(path, photos)
+    length = video.count / video.fps if video.count else 0.0
+    for time, frame in decode(video, warn):
+        if until and time > until:
+            break
+        if time < len(photos) / fps - 1e-6:
+            continue
+        report(min(time / length, 1.0) if length else 0.5, f"frame at {time:.1f} s")
+        name = f"{len(photos):06d}.jpg"
+        rgb = upright(np.asarray(frame.to_ndarray(format="rgb24"), np.uint8), frame)
+        image.write(folder / name, rgb, quality=JPEG_QUALITY)
+        size = (rgb.shape[1], rgb.shape[0])
+        focal = None if video.focal_35mm is None else video.focal_35mm / FILM_DIAGONAL_MM * math.hypot(*size)
+        photos.append(Photo(name, *size, focal, time))
+    check_count(video.path, photos)
     return photos
+
+
+def check_perspective(source: Path, first: Path, photo: Photo) -> None:
+    """Raise an InputError if photos show the whole sphere, or two fisheye circles: they have no focal length.
+
+    Args:
+        source: what the user gave: a folder or a video.
+        first: file of the first photo.
+        photo: its metadata.
+    """
+    if photo.width != 2 * photo.height or photo.focal is not None:
+        return
+    grey = image.read_levels(first)
+    if panorama.fisheye_pair(grey):
+        raise InputError(source, "shows two fisheye circles side by side, as 360 cameras record them", panorama.STITCH)
+    if panorama.whole_sphere(grey):
+        raise InputError(
+            source, "shows 360 panoramas; here, lenses of perspective photos are solved",
+            "Give the video, or the folder as frames, to `scan2sim slam`, which tracks panoramas. If the photos are "
+            "perspective ones, give --focal (pixels)",
+        )  # fmt: skip
 
 
 def stage(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, str]:
