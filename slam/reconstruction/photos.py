@@ -77,9 +77,11 @@ def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:
     """Usable photos of a folder, and a warning for each damaged one, which is skipped.
 
     Raises:
-        InputError: there are no photos, or none can be read. DataError: fewer than `MIN_PHOTOS`.
+        InputError: there are no photos, or none can be read. DataError: fewer than `MIN_PHOTOS`. UnavailableError:
+            no photo's decoder is installed.
     """
     names, photos, warnings = list_photos(folder), list[Photo](), list[str]()
+    missing: UnavailableError | None = None
     if not names:
         raise InputError(
             folder, f"contains no photos ({' '.join(image.SUFFIXES)})", "Give a folder of photos, or a video"
@@ -91,12 +93,15 @@ def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:
             image.check_decodes(path)
             width, height = image.size_of(path)
         except (InputError, UnavailableError) as error:
+            missing = error if isinstance(error, UnavailableError) else missing
             warnings.append(f"{name} is skipped: {error.cause}")
             continue
         equivalent, taken = exif.focal_35mm(path), exif.time_taken(path)
         focal = None if equivalent is None else equivalent / FILM_DIAGONAL_MM * math.hypot(width, height)
         seconds, zoned = taken or (None, True)
         photos.append(Photo(name, width, height, focal, seconds, zoned))
+    if missing is not None and not photos:
+        raise missing
     if not photos:
         raise InputError(folder, f"none of its {len(names)} photos can be read ({warnings[0]})", "Copy them again")
     check_count(folder, photos)
