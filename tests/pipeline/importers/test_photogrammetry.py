@@ -177,6 +177,27 @@ def test_opensfm_model_is_placed_by_its_reference(tmp_path: Path, crs: str | Non
     assert np.abs(tile.frame.to_crs(cloud.xyz)[3] - on_earth(np.array([[3.0, 6.0, 3.0]]), code)).max() < 0.05
 
 
+@pytest.mark.parametrize("named", ["", "opensfm/reconstruction.json"])
+def test_projected_reconstruction_of_odm_is_not_taken_for_a_topocentric_one(tmp_path: Path, named: str) -> None:
+    """ODM's reconstruction.json is in the CRS minus an offset; photos are placed by the topocentric file beside it."""
+    folder = tmp_path / "opensfm"
+    (folder / "undistorted").mkdir(parents=True)
+    opensfm(folder / "reconstruction.topocentric.json", "brown", REFERENCE)
+    projected = opensfm(folder / "reconstruction.json", "brown", REFERENCE)
+    body = json.loads(projected.read_text(encoding="utf-8"))
+    for shot in body[1]["shots"].values():
+        shot["translation"][0] += 5
+    projected.write_text(json.dumps(body), encoding="utf-8")
+    (folder / "undistorted" / "reconstruction.json").write_bytes(projected.read_bytes())
+    tile = read_tile(import_model("opensfm", tmp_path / named, images(), tmp_path / "t"))
+    poses = {Path(name).stem: pose for name, pose in shots()}
+    for view in tile.views:
+        exact = on_earth(poses[view.photo.stem][None, :3, 3])
+        assert np.abs(tile.frame.to_crs(view.centre) - exact).max() < 0.01
+    with pytest.raises(InputError, match=r"undistorted photos, in projected coordinates.*topocentric\.json"):
+        read("opensfm", folder / "undistorted" / "reconstruction.json", images())
+
+
 # --- Metashape
 
 
