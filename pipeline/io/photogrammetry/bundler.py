@@ -10,6 +10,7 @@ Source: Bundler v0.4 user's manual (https://www.cs.cornell.edu/~snavely/bundler/
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -90,6 +91,7 @@ def camera_key(known: dict[Camera, str], camera: Camera) -> str:
 
 
 def _names(path: Path) -> list[str]:
+    """Names of the photos: a line each, which may end with `0` and the focal length by EXIF."""
     candidates = [
         folder / name for folder in (path.parent, path.parent.parent) for name in ("list.txt", f"{path.stem}.txt")
     ]
@@ -98,7 +100,7 @@ def _names(path: Path) -> list[str]:
         raise InputError(
             candidates[0], "file not found: Bundler's cameras have no names", "Put the list of photos there"
         )
-    return [line.split()[0] for line in non_empty_lines(found)]
+    return [re.sub(r"(\s+[-+.\deE]+){1,2}$", "", line) for line in non_empty_lines(found)]
 
 
 def _camera(size: tuple[int, int], f: float, k1: float, k2: float) -> Camera:

@@ -374,6 +374,13 @@ def test_points_of_bundler_project_to_their_pixels(tmp_path: Path) -> None:
     )
 
 
+def test_names_of_bundler_may_contain_blanks(tmp_path: Path) -> None:
+    path = bundler(tmp_path / "bundle", 500.0, -0.11, 0.02)
+    listed = (path.parent / "list.txt").read_text(encoding="utf-8")
+    (path.parent / "list.txt").write_text(listed.replace("./", "C:/my photos 2/"), encoding="utf-8")
+    assert len(read("bundler", path, images()).shots) == len(shots())
+
+
 def nvm(path: Path, f: float, r: float, fixed: str = "") -> Path:
     rows = [f"NVM_V3{fixed}", "", str(len(shots()))]
     for name, pose in shots():
