@@ -18,7 +18,7 @@ from trimesh.resolvers import Resolver
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, F64, I64, U8, UNCOLOURED, Bools, Frame, Mesh
-from scan2sim.pipeline.io import file_checks, gltf_features
+from scan2sim.pipeline.io import file_checks, foreign_files, gltf_features
 from scan2sim.pipeline.io.images.image import MAX_PIXELS
 from scan2sim.pipeline.io.mesh_files import SUFFIXES, find_beside, ply_textures
 from scan2sim.pipeline.io.source_mesh import SourceMesh, encoded
@@ -109,7 +109,7 @@ def read(path: Path) -> tuple[SourceMesh, list[str]]:
 
 def _load(path: Path, folder: _Folder) -> trimesh.Scene:
     if path.suffix.lower() not in SUFFIXES:
-        raise InputError(path, "is not a mesh that can be read", f"Use {', '.join(SUFFIXES)}")
+        raise foreign_files.unread(path, "is not a mesh that can be read", f"Use {', '.join(SUFFIXES)}")
     if path.suffix.lower() in (".gltf", ".glb"):
         gltf_features.check(path)
     try:

@@ -28,7 +28,7 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError, from_os_error
 from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import F64, Frame, Trajectory
-from scan2sim.pipeline.io import file_checks, tables
+from scan2sim.pipeline.io import file_checks, foreign_files, tables
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.trajectory_columns import MATRIX, UNNAMED, is_number, named, seconds, unnamed
 
@@ -169,7 +169,12 @@ def _lines(path: Path) -> tuple[str, Lines]:
     kind = path.suffix.lower()
     if kind == ".geojson":
         raise InputError(path, "is GeoJSON, which can only be written", "Give the .csv beside it")
-    filled = [(i, line) for i, line in enumerate(tables.read_text(path).splitlines(), 1) if line.strip()]
+    file_checks.check(path)
+    try:
+        text = tables.read_text(path)
+    except InputError as error:  # binary, such as SBET
+        raise foreign_files.unread(path, error.cause, error.remedy) from None
+    filled = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     plain = [(i, line) for i, line in filled if not line.lstrip().startswith("#")]
     if not plain:
         raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES.get(kind, REMEDIES[".csv"]))
