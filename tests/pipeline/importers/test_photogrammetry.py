@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -344,6 +344,36 @@ def test_metashape_chunks_are_placed_by_their_transform(tmp_path: Path) -> None:
             assert np.abs(tile.frame.to_crs(view.centre) - exact).max() < 0.01
     with pytest.raises(SettingError, match="is already georeferenced"):
         import_model("metashape", path, images(), tmp_path / "c", cloud=cloud, gps=True)
+
+
+@pytest.mark.parametrize("bound", [False, True])
+def test_a_metashape_chunk_in_a_national_crs_is_geocentric_in_its_own_datum(tmp_path: Path, bound: bool) -> None:
+    """DHDN (Bessel's ellipsoid): read as WGS 84, heights would be 700 m off."""
+    cart = "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=bessel"
+    origin = np.array(Transformer.from_pipeline(cart).transform(9.0, 50.0, 200.0))
+    a, b = np.radians([50.0, 9.0])
+    R = np.array(
+        [[-np.sin(b), np.cos(b), 0], [-np.sin(a) * np.cos(b), -np.sin(a) * np.sin(b), np.cos(a)]]
+        + [[np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)]]
+    ).T
+    reference = CRS("EPSG:31467").to_wkt("WKT1_GDAL")
+    if bound:
+        shift = "TOWGS84[598.1,73.7,418.2,0.202,0.045,-2.455,6.7],"
+        at = reference.index('AUTHORITY["EPSG","6314"]')
+        reference = reference[:at] + shift + reference[at:]
+    path = metashape(tmp_path / "c.xml", "frame", BROWN, similarity(1.0, R, origin), reference)
+    cloud = tmp_path / "cloud.laz"
+    las.write(cloud, PointCloud(Frame(), np.ones((9, 3), np.float32)))
+    warned: list[str] = []
+    tile = read_tile(import_model("metashape", path, images(), tmp_path / "t", cloud=cloud, warn=warned.append))
+    back = f"+proj=pipeline +step +inv {cart.partition('+step ')[2].partition('+step ')[2]}"
+    back += " +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    poses = {Path(name).stem: pose for name, pose in shots()}
+    for view in tile.views:
+        lon, lat, height = Transformer.from_pipeline(back).transform(*(R @ poses[view.photo.stem][:3, 3] + origin))
+        east, north = Transformer.from_crs("EPSG:4314", "EPSG:31467", always_xy=True).transform(lon, lat)
+        assert np.abs(tile.frame.to_crs(view.centre) - [east, north, height]).max() < 0.01
+    assert not any("ellipsoid" in line for line in warned)
 
 
 # --- Bundler, VisualSFM
