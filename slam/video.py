@@ -17,6 +17,9 @@ from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images.image import SUFFIXES, read_levels
 
+UNSTITCHED_SUFFIXES = (".360", ".insv")
+"""Videos of GoPro Max and Insta360, whose frames are two fisheye pictures or parts of a cube."""
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -96,6 +99,9 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
         return _folder(path, fps, times)
     if not path.is_file():
         raise InputError(path, "file not found", "Check the path; give a video file, or a folder of images")
+    if path.suffix.lower() in UNSTITCHED_SUFFIXES:
+        cause = "is a 360 degree video that isn't stitched: each lens has its own picture"
+        raise InputError(path, cause, "Export it as an equirectangular MP4 (GoPro Player, Insta360 Studio)")
     av = _av()
     try:
         with av.open(str(path.absolute())) as container:  # FFmpeg takes `12:30.mp4` for an address

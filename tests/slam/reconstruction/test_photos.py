@@ -1,4 +1,4 @@
-"""Folders of photos: formats that aren't read are named instead of being left out silently."""
+"""Photos and videos in formats that aren't read are named instead of being left out, or read wrongly."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.slam.reconstruction.photos import no_photos, read_photos
+from scan2sim.slam.video import open_video
 
 
 def album(folder: Path, jpegs: int, others: tuple[str, ...]) -> Path:
@@ -41,3 +42,10 @@ def test_photos_in_other_formats_are_counted_unless_a_copy_is_read(tmp_path: Pat
 def test_too_few_photos_because_of_their_format_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"only 2 photos, and 1 photos in formats that aren't read \(\.heic\)"):
         read_photos(album(tmp_path, 2, ("3.heic",)), silent)
+
+
+@pytest.mark.parametrize("name", ["GS010001.360", "VID_00_001.insv"])
+def test_unstitched_videos_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"....ftypmp42")
+    with pytest.raises(InputError, match=r"isn't stitched.*equirectangular MP4"):
+        open_video(tmp_path / name)
