@@ -26,7 +26,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def read(model: Path, photos: Photos) -> Model:
-    """Read a .out file; its list of photos is `list.txt` or `<name>.txt` beside it, or one folder up."""
+    """Read a .out file; its list of photos is beside it, or one folder up: `list.txt`, or as `_names` lists."""
     path = next((model / p for p in ("bundle.out", "bundle/bundle.out") if (model / p).is_file()), model)
     lines = non_empty_lines(path)
     try:
@@ -91,10 +91,12 @@ def camera_key(known: dict[Camera, str], camera: Camera) -> str:
 
 
 def _names(path: Path) -> list[str]:
-    """Names of the photos: a line each, which may end with `0` and the focal length by EXIF."""
-    candidates = [
-        folder / name for folder in (path.parent, path.parent.parent) for name in ("list.txt", f"{path.stem}.txt")
-    ]
+    """Names of the photos: a line each, which may end with `0` and the focal length by EXIF.
+
+    The list has the name that Bundler, COLMAP (`bundle.list.txt`) or RealityCapture (`imagelist.lst`) gives it.
+    """
+    names = ("list.txt", f"{path.stem}.txt", f"{path.stem}.list.txt", f"{path.name}.list.txt", f"{path.stem}.lst")
+    candidates = [folder / name for folder in (path.parent, path.parent.parent) for name in (*names, "imagelist.lst")]
     found = next((candidate for candidate in candidates if candidate.is_file()), None)
     if found is None:
         raise InputError(

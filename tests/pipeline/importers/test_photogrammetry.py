@@ -404,6 +404,13 @@ def test_points_of_bundler_project_to_their_pixels(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("name", ["bundle.list.txt", "bundle.out.list.txt", "imagelist.lst"])
+def test_list_of_bundler_has_the_name_of_any_program(tmp_path: Path, name: str) -> None:
+    path = bundler(tmp_path / "bundle", 500.0, -0.11, 0.02)
+    (path.parent / "list.txt").rename(path.parent / name)
+    assert len(read("bundler", path, images()).shots) == len(shots())
+
+
 def test_names_of_bundler_may_contain_blanks(tmp_path: Path) -> None:
     path = bundler(tmp_path / "bundle", 500.0, -0.11, 0.02)
     listed = (path.parent / "list.txt").read_text(encoding="utf-8")
