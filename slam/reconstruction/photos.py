@@ -17,6 +17,7 @@ from scan2sim.pipeline.core.errors import DataError, InputError, UnavailableErro
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images import exif, image
+from scan2sim.pipeline.io.images.decoders import heif
 from scan2sim.slam.video import Video, decode, upright
 
 COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
@@ -25,6 +26,10 @@ MIN_PHOTOS = 3
 """Photos that a reconstruction needs: two have no scale in common with a third."""
 FILM_DIAGONAL_MM = math.hypot(36, 24)
 """Diagonal of the film that "35 mm equivalent" refers to (CIPA DCG-001)."""
+UNREAD_SUFFIXES = (
+    ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gpr", ".insp"
+)  # fmt: skip
+"""Raw photos, those of 360-degree cameras and rare formats, which aren't read."""
 JPEG_QUALITY = 95
 """Quality of the JPEG files of video frames, 0 to 100."""
 
@@ -57,16 +62,46 @@ class Photo:
 def list_photos(folder: Path) -> list[str]:
     """Names of all photos in a folder and its subfolders, in natural order (2 before 10).
 
+    Of an iPhone's photo and its JPEG copy, the copy.
+
     Raises:
         InputError: the folder is missing.
     """
     if not folder.is_dir():
         raise InputError(folder, "folder not found", "Check the path; give a folder of photos, or a video file")
-    found = (path for path in folder.rglob("*") if path.suffix.lower() in image.SUFFIXES and path.is_file())
+    found = _files(folder, image.SUFFIXES)
+    others = {_stem(name) for name in found if Path(name).suffix.lower() not in heif.SUFFIXES}
+    return [name for name in found if Path(name).suffix.lower() not in heif.SUFFIXES or _stem(name) not in others]
+
+
+def no_photos(folder: Path) -> InputError:
+    """The error of a folder without photos; names those in formats that aren't read."""
+    cause, remedy = f"contains no photos ({' '.join(image.SUFFIXES)})", "Give a folder of photos, or a video file"
+    return InputError(folder, cause, remedy) if (left := _unread(folder, ())) is None else InputError(folder, *left)
+
+
+def _unread(folder: Path, names: Sequence[str]) -> tuple[str, str] | None:
+    """Cause and remedy of photos in other formats without a readable copy beside them; None if there are none."""
+    copies = {_stem(name) for name in names}
+    left = [name for name in _files(folder, UNREAD_SUFFIXES) if _stem(name) not in copies]
+    if not left:
+        return None
+    kinds = " ".join(sorted({Path(name).suffix.lower() for name in left}))
+    cause = f"has {len(left)} photos in formats that aren't read ({kinds}): {', '.join(left[:3])}"
+    remedy = "Convert them to JPEG with their EXIF data (`magick mogrify -format jpg`; stitch 360 degree photos first)"
+    return cause, remedy
+
+
+def _files(folder: Path, suffixes: Sequence[str]) -> list[str]:
+    found = (path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
     names = (path.relative_to(folder) for path in found)
     return sorted(
         (name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts)), key=_natural
     )
+
+
+def _stem(name: str) -> str:
+    return name.rpartition(".")[0].lower()
 
 
 def _natural(name: str) -> list[Any]:
@@ -74,7 +109,7 @@ def _natural(name: str) -> list[Any]:
 
 
 def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:
-    """Usable photos of a folder, and a warning for each damaged one, which is skipped.
+    """Usable photos of a folder, and warnings: damaged ones, and those in other formats, are left out.
 
     Raises:
         InputError: there are no photos, or none can be read. DataError: fewer than `MIN_PHOTOS`. UnavailableError:
@@ -83,9 +118,9 @@ def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:
     names, photos, warnings = list_photos(folder), list[Photo](), list[str]()
     missing: UnavailableError | None = None
     if not names:
-        raise InputError(
-            folder, f"contains no photos ({' '.join(image.SUFFIXES)})", "Give a folder of photos, or a video"
-        )
+        raise no_photos(folder)
+    if (left := _unread(folder, names)) is not None:
+        warnings.append(f"{folder.name} {left[0]}; they are left out. {left[1]}")
     for i, name in enumerate(names):
         report(i / len(names), name)
         path = folder / name
@@ -103,15 +138,17 @@ def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:
     if missing is not None and not photos:
         raise missing
     if not photos:
-        raise InputError(folder, f"none of its {len(names)} photos can be read ({warnings[0]})", "Copy them again")
+        raise InputError(folder, f"none of its {len(names)} photos can be read ({warnings[-1]})", "Copy them again")
     check_count(folder, photos)
     return photos, warnings
 
 
 def check_count(source: Path, photos: Sequence[Any]) -> None:
-    """Raise a DataError if there are too few photos to reconstruct."""
+    """Raise a DataError if there are too few photos to reconstruct, an InputError if others aren't read."""
     if len(photos) < MIN_PHOTOS:
         count = f"only {len(photos)} photo{'s' if len(photos) > 1 else ''}"
+        if source.is_dir() and (left := _unread(source, list_photos(source))) is not None:
+            raise InputError(source, f"has {count}, and {left[0].removeprefix('has ')}", left[1])
         raise DataError(
             source, f"has {count}, too few to find where they were taken",
             f"Give at least {MIN_PHOTOS} that overlap, from different positions",

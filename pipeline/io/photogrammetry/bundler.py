@@ -10,6 +10,7 @@ Source: Bundler v0.4 user's manual (https://www.cs.cornell.edu/~snavely/bundler/
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,7 +26,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def read(model: Path, photos: Photos) -> Model:
-    """Read a .out file; its list of photos is `list.txt` or `<name>.txt` beside it, or one folder up."""
+    """Read a .out file; its list of photos is beside it, or one folder up: `list.txt`, or as `_names` lists."""
     path = next((model / p for p in ("bundle.out", "bundle/bundle.out") if (model / p).is_file()), model)
     lines = non_empty_lines(path)
     try:
@@ -90,15 +91,18 @@ def camera_key(known: dict[Camera, str], camera: Camera) -> str:
 
 
 def _names(path: Path) -> list[str]:
-    candidates = [
-        folder / name for folder in (path.parent, path.parent.parent) for name in ("list.txt", f"{path.stem}.txt")
-    ]
+    """Names of the photos: a line each, which may end with `0` and the focal length by EXIF.
+
+    The list has the name that Bundler, COLMAP (`bundle.list.txt`) or RealityCapture (`imagelist.lst`) gives it.
+    """
+    names = ("list.txt", f"{path.stem}.txt", f"{path.stem}.list.txt", f"{path.name}.list.txt", f"{path.stem}.lst")
+    candidates = [folder / name for folder in (path.parent, path.parent.parent) for name in (*names, "imagelist.lst")]
     found = next((candidate for candidate in candidates if candidate.is_file()), None)
     if found is None:
         raise InputError(
             candidates[0], "file not found: Bundler's cameras have no names", "Put the list of photos there"
         )
-    return [line.split()[0] for line in non_empty_lines(found)]
+    return [re.sub(r"(\s+[-+.\deE]+){1,2}$", "", line) for line in non_empty_lines(found)]
 
 
 def _camera(size: tuple[int, int], f: float, k1: float, k2: float) -> Camera:

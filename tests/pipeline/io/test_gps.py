@@ -75,6 +75,15 @@ def table(heading: str, delimiter: str = ",") -> str:
     return "\n".join([heading, *(delimiter.join(map(repr, row)) for row in points())])
 
 
+def scaled(heading: str, per_second: float, per_metre: float, *, swap: bool = False) -> str:
+    """A table with times and heights in other units: of drones' logs, or of a phone's sensors."""
+    rows = [
+        (f"{time * per_second:.0f}", *((lon, lat) if swap else (lat, lon)), f"{height * per_metre:.6f}")
+        for time, lat, lon, height in points()
+    ]
+    return "\n".join([heading, *(",".join(map(str, row)) for row in rows)])
+
+
 @pytest.mark.parametrize(
     ("name", "text", "sigma"),
     [
@@ -83,6 +92,9 @@ def table(heading: str, delimiter: str = ",") -> str:
         ("a.nmea", nmea(), 1.2),
         ("a.csv", table("timestamp,lat,lng,ele"), None),
         ("b.csv", table("Time (s); Latitude; Longitude; Altitude (m)", ";").replace(",", "."), None),
+        ("elevation.csv", table("time,latitude,longitude,elevation"), None),
+        ("airdata.csv", scaled("time(millisecond),latitude,longitude,altitude(feet)", 1e3, 1 / 0.3048), None),
+        ("phone.csv", scaled("time,longitude_deg,lat_deg,height_m", 1e9, 1, swap=True), None),
     ],
 )
 def test_all_formats_give_the_same_track(tmp_path: Path, name: str, text: str, sigma: float | None) -> None:
