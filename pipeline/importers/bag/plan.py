@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -15,10 +17,11 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers.bag import contents, images
 from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of
+from scan2sim.pipeline.importers.bag.clocks import check_clocks
 from scan2sim.pipeline.importers.bag.contents import Contents
 from scan2sim.pipeline.importers.bag.point_cloud2 import InvalidCloud
 from scan2sim.pipeline.importers.bag.reader import plain
-from scan2sim.pipeline.importers.bag.transforms import WORLD_FRAMES
+from scan2sim.pipeline.importers.bag.transforms import WORLD_FRAMES, earth_centred, pose_matrix, without_turns
 from scan2sim.pipeline.io import urdf as urdf_io
 from scan2sim.pipeline.io.calibration import read_camera
 
@@ -179,7 +182,17 @@ class _Planner:
         poses = self.poses(scanner)
         gps = self.gps(poses)
         cameras = self.cameras(scanner)
+        if self.params.stamps == "header":
+            self._check_clocks(lidars, cameras, poses, gps)
         return Plan(lidars, cameras, poses, gps, self.all_uses(), tuple(self.warnings))
+
+    def _check_clocks(
+        self, lidars: tuple[Lidar, ...], cameras: tuple[PhotoSource, ...], poses: PoseSource, gps: str
+    ) -> None:
+        others = [*(one.topic for one in (*lidars[1:], *cameras)), *filter(None, (poses.topic, poses.imu, gps))]
+        frames = self.found.frames
+        above = frames.ancestors(lidars[0].frame, poses.world) if poses.kind == "tf" else []
+        check_clocks(self.found, lidars[0].topic, others, [link for link in above if link in frames.moving])
 
     def _add_urdf(self) -> None:
         """Add the fixed joints of the robot's description; links of the bag itself are kept."""
@@ -365,7 +378,13 @@ class _Planner:
         if wanted in (AUTO, TF):
             given = self.params.world_frame if wanted == TF or self.params.world_frame else None
             world = frames.world_frame(scanner, given)
+            if world is not None and wanted == AUTO and earth_centred(frames.poses_of(scanner, world)[1]):
+                self.warnings.append(
+                    f"/tf has poses in the earth-centred frame {world!r}, whose z axis isn't up: not used"
+                )
+                world = None
             if world is not None:
+                self._warn_parents(scanner, world)
                 for topic in self.found.topics("tf"):
                     if not contents.is_static(topic):
                         self.uses[topic] = f"poses of {scanner} in {world}"
@@ -389,6 +408,17 @@ class _Planner:
             return PoseSource("odometry", topic, child)
         return PoseSource("sweeps")
 
+    def _warn_parents(self, scanner: str, world: str) -> None:
+        """Warn of frames above the scanner that have several parents, as with two odometries at once."""
+        frames = self.found.frames
+        for parent, child in frames.ancestors(scanner, world):
+            others = [name for name in frames.parents(child) if name != parent and (name, child) in frames.moving]
+            if others:
+                listed = ", ".join(map(repr, others))
+                self.warnings.append(
+                    f"{child!r} has several parents in /tf: {parent!r} is used, not {listed} (--world-frame)"
+                )
+
     def child(self, topic: str) -> str:
         """Frame whose pose an odometry gives."""
         return odometry_child(self.found.first[topic])
@@ -411,10 +441,17 @@ class _Planner:
             return place, -self.found.bag.topics[topic].count
 
         frames = self.found.frames
-        own = [topic for topic in self.found.topics("odometry") if frames.connected(self.child(topic), scanner)]
+        own = []
         for topic in self.found.topics("odometry"):
-            if topic not in own:
+            T = odometry_poses(self.found.samples.get(topic, []))
+            if not frames.connected(self.child(topic), scanner):
                 self.uses[topic] = f"not used: no static transform from {self.child(topic)!r} to {scanner!r}"
+            elif earth_centred(T):
+                self.uses[topic] = "not used: poses in an earth-centred frame, whose z axis isn't up"
+            elif without_turns(T):
+                self.uses[topic] = "not used: positions without orientations"
+            else:
+                own.append(topic)
         if not own:
             return None
         best = min(own, key=rank)
@@ -423,7 +460,9 @@ class _Planner:
     def _gnss(self, scanner: str, required: bool) -> PoseSource | None:
         """Satellite positions with an IMU's orientation; None if they are too rare or inexact for it."""
         fixes, imus, frames = self.found.topics("fix"), self.found.topics("imu"), self.found.frames
-        oriented = [topic for topic in imus if has_orientation(self.found.first[topic])]
+        samples = self.found.samples
+        oriented = [name for name in imus if not without_orientation(samples.get(name) or [self.found.first[name]])]
+        self.uses.update({name: "not used: has no orientations" for name in imus if name not in oriented})
         usable = [topic for topic in oriented if frames.connected(self.found.frame(topic), scanner)]
         if required:
             for kind, names in (("NavSatFix", fixes), ("Imu with an orientation", oriented)):
@@ -435,12 +474,15 @@ class _Planner:
         if not fixes or not usable:
             return None
         fix = self._best_fix()
-        samples = self.found.samples.get(fix, [])
-        sigmas = [fix_sigma(sample) for sample in samples]
-        known = [sigma for sigma in sigmas if sigma is not None]
-        exact = not known or float(np.median(known)) <= MAX_FIX_SIGMA_M
-        if not required and not (contents.rate(samples) >= MIN_FIX_RATE_HZ and exact):
+        sigma = self._sigma(fix)
+        exact = sigma is None or sigma <= MAX_FIX_SIGMA_M
+        if not required and not (contents.rate(self.found.samples.get(fix, [])) >= MIN_FIX_RATE_HZ and exact):
             return None
+        if sigma is None:
+            self.warnings.append(
+                f"{fix} has no covariances: its fixes are taken to be exact to {MAX_FIX_SIGMA_M:g} m, as with RTK; "
+                "if they aren't, use --poses sweeps, which fuses them with lidar odometry"
+            )
         imu = max(usable, key=lambda topic: self.found.bag.topics[topic].count)
         receiver, body = self.found.frame(fix), self.found.frame(imu)
         if receiver != body and not frames.connected(body, receiver):
@@ -450,7 +492,20 @@ class _Planner:
         return PoseSource("gnss", fix, imu=imu, frames=(receiver, body))
 
     def _best_fix(self) -> str:
-        return max(self.found.topics("fix"), key=lambda topic: self.found.bag.topics[topic].count)
+        """The receiver with valid fixes, if possible exact ones, and with most of them."""
+
+        def rank(topic: str) -> tuple[bool, bool, int]:
+            sigma = self._sigma(topic)
+            valid = any(valid_fix(fix) for fix in self.found.samples.get(topic, []))
+            return valid, sigma is not None and sigma <= MAX_FIX_SIGMA_M, self.found.bag.topics[topic].count
+
+        return max(self.found.topics("fix"), key=rank)
+
+    def _sigma(self, topic: str) -> float | None:
+        """Median standard deviation of the first seconds' valid fixes, metres; None if it is unknown."""
+        fixes = [fix for fix in self.found.samples.get(topic, []) if valid_fix(fix)]
+        known = [sigma for fix in fixes if (sigma := fix_sigma(fix)) is not None]
+        return float(np.median(known)) if known else None
 
     def gps(self, poses: PoseSource) -> str:
         """Topic of fixes to fuse with lidar odometry; "" for none."""
@@ -518,6 +573,25 @@ def odometry_child(message: Any) -> str:
     return str(message.child_frame_id).lstrip("/") or "base_link"
 
 
+def odometry_poses(messages: Sequence[Any]) -> F64:
+    """Poses (N, 4, 4) of Odometry messages, without invalid ones."""
+    T = []
+    for message in messages:
+        with suppress(ValueError):
+            T.append(pose_matrix(message.pose.pose))
+    return np.array(T).reshape(-1, 4, 4)
+
+
+def without_orientation(imus: Sequence[Any]) -> bool:
+    """Whether Imu messages have no orientation: none is valid, or it stays that of an empty message while it turns.
+
+    Drivers of ROS 2 that don't fill it in leave the default of the message, (0, 0, 0, 1) with covariance 0.
+    """
+    valid = [imu for imu in imus if has_orientation(imu)]
+    turns = any(abs(getattr(imu.angular_velocity, axis)) > 0 for imu in valid for axis in "xyz")
+    return all((q := imu.orientation).x == q.y == q.z == 0 for imu in valid) and (turns or not valid)
+
+
 def has_orientation(imu: Any) -> bool:
     """Whether an Imu message has an orientation (REP 145: a covariance of -1 means it has none)."""
     q = imu.orientation
@@ -525,12 +599,16 @@ def has_orientation(imu: Any) -> bool:
     return float(imu.orientation_covariance[0]) != -1 and abs(length - 1) < 0.1
 
 
+def valid_fix(fix: Any) -> bool:
+    """Whether a NavSatFix has a position that UTM covers."""
+    position = (float(fix.latitude), float(fix.longitude), float(fix.altitude))
+    return int(fix.status.status) >= 0 and bool(np.isfinite(position).all()) and abs(position[0]) <= 84
+
+
 def fix_sigma(fix: Any) -> float | None:
-    """Horizontal standard deviation of a NavSatFix in metres, or None if it is unknown."""
-    if int(fix.position_covariance_type) == 0:
-        return None
+    """Horizontal standard deviation of a NavSatFix in metres, or None if it is unknown (also if it is zero)."""
     variance = (float(fix.position_covariance[0]) + float(fix.position_covariance[4])) / 2
-    return float(np.sqrt(max(0.0, variance)))
+    return float(np.sqrt(variance)) if int(fix.position_covariance_type) != 0 and variance > 0 else None
 
 
 def _unused(found: Contents, topic: str) -> str:

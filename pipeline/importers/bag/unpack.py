@@ -300,10 +300,10 @@ def unpack(
             "sweeps": len(writer.times), "points": writer.points, "photos": sum(counts.values()),
             "seconds": round((max(writer.times) - min(writer.times)) / 1e9, 3), "poses": plan.poses.setting,
         }  # fmt: skip
-        return Unpacked(
-            out / "sweeps", _rig(out / "photos", kept), _poses(poses, plan.poses.kind, out), _gps(poses, plan.gps, out),
-            metrics,
-        )  # fmt: skip
+        trajectory, gps = _poses(poses, plan.poses.kind, out), _gps(poses, plan.gps, out)
+        for text in poses.warnings:
+            warn(text)
+        return Unpacked(out / "sweeps", _rig(out / "photos", kept), trajectory, gps, metrics)
 
 
 def _write_photo(bag: Bag, message: Message, source: PhotoSource, folder: Path, time_ns: int) -> None:
