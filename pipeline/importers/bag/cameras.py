@@ -56,5 +56,10 @@ def camera_of(info: Any, *, rectified: bool) -> Camera:
     return Camera(model, *size, float(fx), float(fy), float(cx), float(cy), tuple(float(d) for d in D[:wanted]))
 
 
+def camera_offset(info: Any) -> float:
+    """Offset of a camera from its frame by P of its `CameraInfo`: not 0 for the second camera of a stereo pair."""
+    return float(_field(info, "p")[3])
+
+
 def _field(info: Any, name: str) -> Any:
     return getattr(info, name, None) if hasattr(info, name) else getattr(info, name.upper())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from scan2sim.pipeline.core.parameters import Seconds
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers.bag import contents, images
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of
+from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, camera_offset
 from scan2sim.pipeline.importers.bag.clocks import check_clocks
 from scan2sim.pipeline.importers.bag.contents import Contents
 from scan2sim.pipeline.importers.bag.point_cloud2 import InvalidCloud
@@ -31,6 +32,8 @@ MIN_FIX_RATE_HZ, MAX_FIX_SIGMA_M = 4.0, 0.5
 BODY_FRAMES = ("base_link", "base_footprint", "base", "body")
 """Names of the vehicle's frame (REP 105), the preferred one first."""
 NAMES_OF_IMAGES = ("image", "image_raw", "image_rect", "image_color", "image_rect_color", "image_mono", "raw")
+INFRARED = re.compile(r"(^|[/_])(infra\d?|infrared|ir|thermal)([/_]|$)")
+"""Part of the name of a topic with infrared images."""
 URDF_TOLERANCE = 0.005
 """Difference between a link of a URDF and that of the bag that is worth a warning: metres, and rotation elements."""
 LIST_TOPICS = "`scan2sim inspect` lists its topics"
@@ -39,6 +42,13 @@ LIDAR_PACKETS = (
     "NebulaPackets", "RslidarPacket", "RslidarScan", "LslidarPacket", "LslidarScan",
 )  # fmt: skip
 """Types, without their package, of a lidar's raw packets, which only its driver can decode."""
+RADAR_FIELD = re.compile("rcs|rcs_.*|.*_rcs|radar_?cross_?section|snr_db|v_?doppler_mps")
+"""Names of fields that only radars have."""
+DEPTH_CAMERA = "not used: points of a depth camera (--lidar uses it)"
+SAME_POINTS = 0.8
+"""Share of points from which two topics have the same ones, as whole sweeps and their segments."""
+MIN_SHARE_OF_SINGLE = 0.5
+"""Points of single lidars, as a share of those of a topic in the vehicle's frame, from which that one repeats them."""
 VIDEOS = ("CompressedVideo", "FFMPEGPacket", "theora_image_transport/msg/Packet")
 """Ends of the types of compressed videos."""
 
@@ -238,8 +248,9 @@ class _Planner:
 
     def _default_lidars(self) -> list[str]:
         """One topic of each frame, the best one; that with most points first."""
-        best: dict[str, tuple[tuple[bool, int], str]] = {}
-        worlds = {parent for parent, _ in self.found.frames.moving} | set(WORLD_FRAMES)
+        best: dict[str, str] = {}
+        odometries = {self.found.frame(topic) for topic in self.found.topics("odometry")}
+        worlds = {parent for parent, _ in self.found.frames.moving} | odometries | set(WORLD_FRAMES)
         for topic in self.found.topics("lidar"):
             sweep, frame = self.found.first[topic], self.found.frame(topic)
             samples = self.found.samples.get(topic)
@@ -248,17 +259,15 @@ class _Planner:
             elif frame in worlds and not self.found.bag.topics[topic].type.startswith("livox"):
                 self.uses[topic] = f"not used: in the frame {frame}, not a lidar's (--lidar uses it)"
             elif samples and sweep.rgb is not None and samples[0].height > 1:
-                self.uses[topic] = "not used: points of a depth camera (--lidar uses it)"
+                self.uses[topic] = DEPTH_CAMERA
+            elif samples and _is_radar(topic, samples[0]):
+                self.uses[topic] = "not used: points of a radar (--lidar uses it)"
             else:
-                rank = (sweep.time is not None, len(sweep) * self.found.bag.topics[topic].count)
-                old = best.get(frame)
-                if old is not None:
-                    loser, winner = (old[1], topic) if rank > old[0] else (topic, old[1])
-                    self.uses[loser] = f"not used: of the same lidar as {winner} (--lidar uses it)"
-                if old is None or rank > old[0]:
-                    best[frame] = rank, topic
-        order = sorted(best.values(), key=lambda one: -one[0][1])
-        names = [topic for _, topic in order]
+                old = best.setdefault(frame, topic)
+                if old != topic:
+                    loser, best[frame] = (old, topic) if self._better(topic, old) else (topic, old)
+                    self.uses[loser] = f"not used: of the same lidar as {best[frame]} (--lidar uses it)"
+        names = self._scanners(sorted(best.values(), key=lambda topic: -self._points(topic)))
         if not names:
             return []
         first, *others = names
@@ -271,6 +280,42 @@ class _Planner:
                 self.uses[topic] = f"not used: {missing} (--transform adds it)"
                 self.warnings.append(f"{topic} is left out: {missing}; give it with --transform")
         return usable
+
+    def _scanners(self, topics: list[str]) -> list[str]:
+        """Topics without depth cameras, and without points of other topics in the vehicle's frame, if others remain."""
+        lidars = [topic for topic in topics if not self._by_depth_camera(topic)]
+        if lidars:
+            self.uses.update(dict.fromkeys((topic for topic in topics if topic not in lidars), DEPTH_CAMERA))
+            topics = lidars
+        single = [topic for topic in topics if self.found.frame(topic) not in BODY_FRAMES]
+        for topic in (topic for topic in topics if topic not in single):
+            near = [
+                one for one in single if self.found.frames.connected(self.found.frame(topic), self.found.frame(one))
+            ]
+            if sum(map(self._points, near)) > MIN_SHARE_OF_SINGLE * self._points(topic):
+                text = f"not used: probably the points of {', '.join(near)} in the vehicle's frame (--lidar uses it)"
+                self.uses[topic] = text
+                topics = [other for other in topics if other != topic]
+        return topics
+
+    def _better(self, topic: str, other: str) -> bool:
+        """Whether a topic of a lidar is better than another: times, more points, or as many in larger sweeps."""
+        timed = [self.found.first[name].time is not None for name in (topic, other)]
+        points = [self._points(name) for name in (topic, other)]
+        if timed[0] != timed[1]:
+            return timed[0]
+        if min(points) < SAME_POINTS * max(points):
+            return points[0] > points[1]
+        return len(self.found.first[topic]) > len(self.found.first[other])
+
+    def _points(self, topic: str) -> int:
+        """Number of points of a topic, by its first sweep."""
+        return len(self.found.first[topic]) * self.found.bag.topics[topic].count
+
+    def _by_depth_camera(self, topic: str) -> bool:
+        """Whether points without times have colours or are in the frame of a camera."""
+        sweep, frame = self.found.first[topic], self.found.frame(topic)
+        return sweep.time is None and (sweep.rgb is not None or frame.endswith(("optical_frame", "_optical")))
 
     def cameras(self, scanner: str) -> tuple[PhotoSource, ...]:
         given = self.params.camera
@@ -293,28 +338,56 @@ class _Planner:
         return tuple(sources)
 
     def _default_cameras(self) -> list[str]:
-        """One topic of each camera: with most images, with colours, not rectified, not compressed."""
-        best: dict[str, tuple[tuple[Any, ...], str]] = {}
+        """One topic of each camera: with most images, with colours, not rectified, not compressed.
+
+        Topics are of the same camera if they have the same CameraInfo, or images of the same size in the same frame
+        (drivers publish a camera's images several times). Grey infrared images are used if there are no others.
+        """
+        topics = []
         for topic in self.found.topics("image", "compressed"):
-            first = self.found.first[topic]
-            encoding = str(getattr(first, "encoding", "")) or str(getattr(first, "format", ""))
-            if encoding in images.DEPTH_ENCODINGS or "compressedDepth" in (encoding, topic.rpartition("/")[2]):
+            if images.is_depth(self._encoding(topic)) or "compressedDepth" in topic:
                 self.uses[topic] = "not used: depth images"
-                continue
-            info = self._info(topic)
-            if info is None and self.intrinsics is None:
+            elif self._info(topic) is None and self.intrinsics is None:
                 self.uses[topic] = "not used: no CameraInfo (--intrinsics gives its camera)"
-                continue
-            compressed = self.found.kind(topic) == "compressed"
-            rank = (self.found.bag.topics[topic].count, images.colours(encoding), "rect" not in topic, not compressed)
-            key = info or topic
-            old = best.get(key)
-            if old is not None:
-                loser, winner = (old[1], topic) if rank > old[0] else (topic, old[1])
-                self.uses[loser] = f"not used: of the same camera as {winner} (--camera uses it)"
-            if old is None or rank > old[0]:
-                best[key] = rank, topic
-        return sorted(topic for _, topic in best.values())
+            else:
+                topics.append(topic)
+        topics = self._best_cameras(topics, lambda topic: self._info(topic) or topic)
+        topics = self._best_cameras(topics, self._frame_and_size)
+        infrared = [topic for topic in topics if INFRARED.search(topic) and not images.colours(self._encoding(topic))]
+        if len(infrared) < len(topics):
+            self.uses.update(dict.fromkeys(infrared, "not used: infrared images (--camera uses it)"))
+            topics = [topic for topic in topics if topic not in infrared]
+        return sorted(topics)
+
+    def _best_cameras(self, topics: list[str], key: Callable[[str], Any]) -> list[str]:
+        """Of topics of the same camera (the same `key`) the best one."""
+
+        def rank(topic: str) -> tuple[Any, ...]:
+            info = self._info(topic)
+            second = info is not None and camera_offset(self.found.first[info]) != 0
+            count, compressed = self.found.bag.topics[topic].count, self.found.kind(topic) == "compressed"
+            return not second, count, images.colours(self._encoding(topic)), "rect" not in topic, not compressed
+
+        best: dict[Any, str] = {}
+        for topic in topics:
+            own = key(topic)
+            old = best.setdefault(own, topic)
+            if old != topic:
+                loser, best[own] = (old, topic) if rank(topic) > rank(old) else (topic, old)
+                self.uses[loser] = f"not used: of the same camera as {best[own]} (--camera uses it)"
+        return list(best.values())
+
+    def _encoding(self, topic: str) -> str:
+        """Encoding of a topic's images, or the format of compressed ones."""
+        first = self.found.first[topic]
+        return str(getattr(first, "encoding", "")) or str(getattr(first, "format", ""))
+
+    def _frame_and_size(self, topic: str) -> Any:
+        """Frame and size of a topic's images; the topic itself if they are unknown."""
+        frame = self.found.headers[topic].frame
+        with suppress(InputError):
+            return (frame, self._size(topic)) if frame else topic
+        return topic
 
     def _info(self, topic: str) -> str | None:
         """Topic of the CameraInfo of an image topic: beside it, else the only one in its frame."""
@@ -331,7 +404,10 @@ class _Planner:
         if self.intrinsics is not None:
             return read_camera(self.intrinsics, width, height)
         info = self._info(topic)
-        remedy = "Give the camera with --intrinsics (a TOML file with [[cameras]] as in a tile), or --camera none"
+        remedy = (
+            "Give the camera with --intrinsics (a TOML file with [[cameras]] as in a tile), or choose topics with "
+            "--camera (none: no photos)"
+        )
         if info is None:
             infos = ", ".join(self.found.topics("info")) or "none"
             raise InputError(self.path, f"has no CameraInfo of {topic} (it has {infos})", remedy)
@@ -621,6 +697,11 @@ def _unused(found: Contents, topic: str) -> str:
         return "not used: compressed video (republish it as CompressedImage)"
     reasons = {"info": ": its images aren't", "": ": of no kind that the import reads", "pose": " (--poses uses it)"}
     return f"not used{reasons.get(found.kind(topic), '')}"
+
+
+def _is_radar(topic: str, cloud: Any) -> bool:
+    """Whether a PointCloud2 is a radar's: by its topic, or radar cross-sections."""
+    return "radar" in topic.lower() or any(RADAR_FIELD.fullmatch(field.name.lower()) for field in cloud.fields)
 
 
 def _is_packets(found: Contents, topic: str) -> bool:

@@ -187,7 +187,7 @@ class PoseMessages:
         keep = np.logical_and.reduce([~in_gap(at, times) for at in sources])
         if not keep.all():
             self.warnings.append(
-                f"{100 * (1 - keep.mean()):.0f} % of the drive are left out, as valid fixes or orientations are missing "
+                f"{100 * (1 - keep.mean()):.0f} % of the drive have no valid fixes or orientations: they are left out "
                 "(--poses sweeps bridges gaps with lidar odometry)"
             )
         return times[keep]
@@ -197,10 +197,11 @@ class PoseMessages:
         body = next((name for name in BODY_FRAMES if self.frames.connected(imu, name)), None)
         error = None if body is None else heading_error(T_world_imu @ self.frames.between(imu, body))
         if error is not None and error > MAX_HEADING_ERROR_DEG:
+            topic = self.plan.poses.imu
             self.warnings.append(
-                f"the orientation of {self.plan.poses.imu} differs by {error:.0f} degrees from the direction of travel: "
-                "it must be to east, north, up (REP 103), not to north, east, down, to magnetic north, or relative to its "
-                "start; compare with --poses sweeps"
+                f"the orientation of {topic} is {error:.0f} degrees off the direction of travel: it must be "
+                "in east, north, up (REP 103), not in north, east, down, to magnetic north, or relative to its start; "
+                "compare with --poses sweeps"
             )
 
 
