@@ -31,4 +31,4 @@ def can_read(params: BagParams) -> None:
     require("ROS bags", "rosbags", extra="bag")
 
 
-READ_BAG = Step("read_bag", 1, read_bag, BagParams, check=can_read, memory=(0.6, 0))
+READ_BAG = Step("read_bag", 2, read_bag, BagParams, check=can_read, memory=(0.6, 0))

@@ -250,7 +250,8 @@ class _Planner:
         """One topic of each frame, the best one; that with most points first."""
         best: dict[str, str] = {}
         odometries = {self.found.frame(topic) for topic in self.found.topics("odometry")}
-        worlds = {parent for parent, _ in self.found.frames.moving} | odometries | set(WORLD_FRAMES)
+        moving = {parent for parent, _ in self.found.frames.moving}  # with joints of wheels, also the vehicle's frame
+        worlds = (moving | odometries | set(WORLD_FRAMES)) - set(BODY_FRAMES)
         for topic in self.found.topics("lidar"):
             sweep, frame = self.found.first[topic], self.found.frame(topic)
             samples = self.found.samples.get(topic)

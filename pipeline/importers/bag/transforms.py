@@ -54,7 +54,7 @@ def in_gap(at: F64, times: F64) -> Bools:
     if not len(steps):
         return np.zeros(len(times), bool)
     before = np.clip(np.searchsorted(at, times) - 1, 0, len(steps) - 1)
-    return np.asarray(steps[before] > _longest_step(steps))
+    return np.asarray((steps[before] > _longest_step(steps)) & (times > at[before]) & (times < at[before + 1]))
 
 
 def covered(at: F64, poses: F64, times: F64) -> Bools:
@@ -67,7 +67,7 @@ def covered(at: F64, poses: F64, times: F64) -> Bools:
     if not len(steps):
         return np.ones(len(times), bool)
     before = np.clip(np.searchsorted(at, times) - 1, 0, len(steps) - 1)
-    gap = (steps[before] > _longest_step(steps)) & (shifts[before] > MAX_SHIFT_M)
+    gap = in_gap(at, times) & (shifts[before] > MAX_SHIFT_M)
     moves = shifts.sum() > MIN_SPEED_MS * (at[-1] - at[0])
     beyond = np.maximum(at[0] - times, times - at[-1]) > _longest_step(steps)
     return np.asarray(~gap & ~(moves & beyond))

@@ -88,6 +88,19 @@ def test_compressed_images_are_copied_unchanged() -> None:
             compressed_file(SimpleNamespace(data=content, format="gif"))
 
 
+@pytest.mark.parametrize(("suffix", "codec"), [(".png", "png"), (".jpg", "jpeg")])
+def test_compressed_bayer_patterns_are_demosaiced(suffix: str, codec: str) -> None:
+    mosaic = np.full((16, 24), 40, np.uint8)
+    mosaic[::2, ::2] = 200  # red pixels of rggb
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 100] if codec == "jpeg" else []
+    content = cv2.imencode(suffix, mosaic, quality)[1].tobytes()
+    made, file = compressed_file(SimpleNamespace(data=content, format=f"bayer_rggb8; {codec} compressed "))
+    blue, green, red = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)[8, 8].astype(int)
+    assert made == ".png" and abs(red - 200) < 20 and abs(blue - 40) < 20 and abs(green - 40) < 20
+    for converted in (f"bayer_rggb8; {codec} compressed mono8", f"bayer_rggb8; {codec} compressed bgr8"):
+        assert compressed_file(SimpleNamespace(data=content, format=converted)) == (suffix, content)
+
+
 def info(model: str, D: list[float], **more: Any) -> Any:
     """A CameraInfo of ROS 2."""
     roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)

@@ -237,15 +237,16 @@ def test_invalid_urdf_is_rejected_with_its_cause(tmp_path: Path, text: str, mess
         read_fixed_joints(tmp_path / "r.urdf")
 
 
-def gnss(bag: BagFile, k: int, time: float) -> None:
+def gnss(bag: BagFile, k: int, time: float, wrong_deg: float = 0.0, sigma: float | None = 0.02) -> None:
     """An antenna 2 m behind the IMU, which is the vehicle's frame; grid north is not true north."""
     from pyproj import Proj, Transformer
 
     place = np.array([500_000 - 150_000.0, 5_400_000, 100])
     antenna = base(k)[:3, :3] @ [-2.0, 0, 0] + base(k)[:3, 3] + place
     lon, lat = Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True).transform(*antenna[:2])
-    bag.fix("/fix", time, "antenna", (lat, lon, antenna[2]), sigma=0.02)
-    turn = Rotation.from_euler("z", -Proj("EPSG:32633").get_factors(lon, lat).meridian_convergence, degrees=True)
+    bag.fix("/fix", time, "antenna", (lat, lon, antenna[2]), sigma=sigma)
+    convergence = Proj("EPSG:32633").get_factors(lon, lat).meridian_convergence
+    turn = Rotation.from_euler("z", wrong_deg - convergence, degrees=True)
     bag.imu("/imu", time, "base", turn.as_matrix() @ base(k)[:3, :3])
     if k == 0:
         T = np.eye(4)
