@@ -456,9 +456,9 @@ class _Planner:
             given = self.params.world_frame if wanted == TF or self.params.world_frame else None
             world = frames.world_frame(scanner, given)
             if world is not None and wanted == AUTO and earth_centred(frames.poses_of(scanner, world)[1]):
-                self.warnings.append(
-                    f"/tf has poses in the earth-centred frame {world!r}, whose z axis isn't up: not used"
-                )
+                self.warnings.append(f"/tf isn't used: its frame {world!r} is earth-centred, its z axis isn't up")
+                moving = [one for one in self.found.topics("tf") if not contents.is_static(one)]
+                self.uses.update(dict.fromkeys(moving, "not used: poses in an earth-centred frame"))
                 world = None
             if world is not None:
                 self._warn_parents(scanner, world)
