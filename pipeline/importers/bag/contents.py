@@ -170,9 +170,10 @@ def _sample(found: Contents, message: Message) -> None:
         add_transforms(found.frames, bag, message, lags=found.link_lags)
         found.first[topic] = None
         return
-    stamp_ns = bag.header(message).stamp_ns
-    if stamp_ns:
-        found.lags[topic] = min(found.lags.get(topic, np.inf), (message.log_ns - stamp_ns) * 1e-9, key=abs)
+    if topic not in found.first or kind in ("odometry", "fix", "imu"):
+        stamp_ns = bag.header(message).stamp_ns
+        if stamp_ns:
+            found.lags[topic] = min(found.lags.get(topic, np.inf), (message.log_ns - stamp_ns) * 1e-9, key=abs)
     if topic not in found.first:
         found.headers[topic] = bag.header(message)
         found.first[topic] = None

@@ -32,6 +32,8 @@ MIN_FIX_RATE_HZ, MAX_FIX_SIGMA_M = 4.0, 0.5
 BODY_FRAMES = ("base_link", "base_footprint", "base", "body")
 """Names of the vehicle's frame (REP 105), the preferred one first."""
 NAMES_OF_IMAGES = ("image", "image_raw", "image_rect", "image_color", "image_rect_color", "image_mono", "raw")
+RECTIFIED = re.compile("rect|undist")
+"""Part of the name of a topic with images without distortion."""
 INFRARED = re.compile(r"(^|[/_])(infra\d?|infrared|ir|thermal)([/_]|$)")
 """Part of the name of a topic with infrared images."""
 URDF_TOLERANCE = 0.005
@@ -49,6 +51,8 @@ SAME_POINTS = 0.8
 """Share of points from which two topics have the same ones, as whole sweeps and their segments."""
 MIN_SHARE_OF_SINGLE = 0.5
 """Points of single lidars, as a share of those of a topic in the vehicle's frame, from which that one repeats them."""
+COMPRESSED_POINTS = "CompressedPointCloud2"
+"""End of the types of compressed points (Draco, Cloudini, zstd), of `point_cloud_transport`."""
 VIDEOS = ("CompressedVideo", "FFMPEGPacket", "theora_image_transport/msg/Packet")
 """Ends of the types of compressed videos."""
 
@@ -228,6 +232,9 @@ class _Planner:
             cause = f"contains no sweeps (PointCloud2 or Livox CustomMsg); its topics: {self._listed()}"
             packets = [topic for topic in self.found.bag.topics if _is_packets(self.found, topic)]
             remedy = "Record the lidar's topic, or name one with --lidar"
+            packed = [one.name for one in self.found.bag.topics.values() if one.type.endswith(COMPRESSED_POINTS)]
+            if packed:
+                remedy = f"{', '.join(packed)} has compressed points: republish them as PointCloud2 and record them"
             if packets:
                 remedy = (
                     f"{', '.join(packets)} has the lidar's raw packets: play the bag while the lidar's driver runs, "
@@ -367,7 +374,7 @@ class _Planner:
             info = self._info(topic)
             second = info is not None and camera_offset(self.found.first[info]) != 0
             count, compressed = self.found.bag.topics[topic].count, self.found.kind(topic) == "compressed"
-            return not second, count, images.colours(self._encoding(topic)), "rect" not in topic, not compressed
+            return not second, count, images.colours(self._encoding(topic)), not RECTIFIED.search(topic), not compressed
 
         best: dict[Any, str] = {}
         for topic in topics:
@@ -413,7 +420,9 @@ class _Planner:
             infos = ", ".join(self.found.topics("info")) or "none"
             raise InputError(self.path, f"has no CameraInfo of {topic} (it has {infos})", remedy)
         try:
-            camera = camera_of(self.found.first[info], rectified="rect" in _base(topic).rpartition("/")[2])
+            camera = camera_of(
+                self.found.first[info], rectified=bool(RECTIFIED.search(_base(topic).rpartition("/")[2]))
+            )
         except InvalidCamera as error:
             raise InputError(self.path, f"the message of {info} {error}", remedy) from None
         if (camera.width, camera.height) == (width, height):
@@ -694,6 +703,8 @@ def _unused(found: Contents, topic: str) -> str:
         return "transforms between frames"
     if _is_packets(found, topic):
         return "not used: raw packets of a lidar, whose driver makes PointCloud2 of them"
+    if found.bag.topics[topic].type.endswith(COMPRESSED_POINTS):
+        return "not used: compressed points (republish them as PointCloud2 with point_cloud_transport)"
     if found.bag.topics[topic].type.endswith(VIDEOS):
         return "not used: compressed video (republish it as CompressedImage)"
     reasons = {"info": ": its images aren't", "": ": of no kind that the import reads", "pose": " (--poses uses it)"}

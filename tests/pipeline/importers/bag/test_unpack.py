@@ -391,11 +391,13 @@ def raw(topic: str, kind: str) -> Writer:
 def test_packets_and_videos_are_named_with_what_to_do(tmp_path: Path, form: str) -> None:
     packets = raw("/velodyne_packets", "velodyne_msgs/msg/VelodyneScan")
     video = raw("/front/video", "foxglove_msgs/msg/CompressedVideo")
-    path = write(bag_path(tmp_path, form), form, tf, packets, video)
+    packed = raw("/rear/points/draco", "point_cloud_interfaces/msg/CompressedPointCloud2")
+    path = write(bag_path(tmp_path, form), form, tf, packets, packed, video)
     with opened(path) as bag:
         uses, error = described(inspected(bag), BagParams())
     assert "raw packets of a lidar, whose driver makes PointCloud2" in uses["/velodyne_packets"]
     assert "republish it as CompressedImage" in uses["/front/video"]
+    assert "republish them as PointCloud2" in uses["/rear/points/draco"]
     assert error is not None and "/velodyne_packets has the lidar's raw packets: play the bag" in str(error)
 
 
