@@ -83,6 +83,17 @@ def _demosaiced(content: bytes, pattern: str) -> tuple[str, bytes]:
     return ".png", cv2.imencode(".png", colour, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
 
 
+def unused_bits(image: Any) -> int:
+    """Number of the highest bits that no pixel of a 16-bit `Image` uses: 4 of a 12-bit camera; 0 of other images."""
+    if not str(image.encoding).lower().endswith(("16", "16uc1", "16uc3")):
+        return 0
+    try:
+        pixels = _bgr(image)
+    except InvalidImage:
+        return 0
+    return 16 - int(pixels.max()).bit_length() if pixels.dtype == np.uint16 else 0
+
+
 def raw_file(image: Any) -> tuple[str, bytes]:
     """Suffix and content of a PNG file of an `Image`.
 

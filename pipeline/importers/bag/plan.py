@@ -32,6 +32,8 @@ MIN_FIX_RATE_HZ, MAX_FIX_SIGMA_M = 4.0, 0.5
 BODY_FRAMES = ("base_link", "base_footprint", "base", "body")
 """Names of the vehicle's frame (REP 105), the preferred one first."""
 NAMES_OF_IMAGES = ("image", "image_raw", "image_rect", "image_color", "image_rect_color", "image_mono", "raw")
+MIN_UNUSED_BITS = 2
+"""Highest bits of 16-bit images that aren't used, from which a warning says so."""
 RECTIFIED = re.compile("rect|undist")
 """Part of the name of a topic with images without distortion."""
 INFRARED = re.compile(r"(^|[/_])(infra\d?|infrared|ir|thermal)([/_]|$)")
@@ -340,6 +342,12 @@ class _Planner:
             T = self.found.frames.between(frame, scanner)
             sources.append(PhotoSource(topic, key, frame, camera, T))
             self.uses[topic] = f"photos; frame {frame}, {camera.model} {camera.width}x{camera.height}"
+            unused = 0 if self.found.kind(topic) == "compressed" else images.unused_bits(self.found.first[topic])
+            if unused >= MIN_UNUSED_BITS:
+                self.warnings.append(
+                    f"the first image of {topic} uses {16 - unused} of 16 bits: its photos are dark (have the driver "
+                    "publish 8 bits, or 16 bits that are shifted)"
+                )
             info = self._info(topic)
             if info is not None and self.intrinsics is None:
                 self.uses[info] = f"calibration of {topic}"

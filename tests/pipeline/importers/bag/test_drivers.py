@@ -195,6 +195,16 @@ def test_depth_images_are_recognized_when_compressed(tmp_path: Path) -> None:
     assert uses["/front/image_raw"].startswith("photos")
 
 
+@pytest.mark.parametrize(("bits", "warned"), [(12, True), (16, False)])
+def test_images_of_12_bits_in_16_are_reported_as_dark(tmp_path: Path, bits: int, warned: bool) -> None:
+    def grey(bag: BagFile, k: int, time: float) -> None:
+        bag.image("/front/image_raw", time, "camera", photo(k)[..., 0].astype(np.uint16) << (bits - 8), "mono16")
+        bag.camera_info("/front/camera_info", time, "camera", CAMERA)
+
+    warnings = planned(write(tmp_path / "bag", "mcap", tf, grey, points)).warnings
+    assert [("uses 12 of 16 bits" in text) for text in warnings] == [True] * warned
+
+
 def test_one_topic_of_each_camera_is_used(tmp_path: Path) -> None:
     """A stereo camera publishes its left images twice, and both in the frame of the left camera; and infrared ones."""
 
