@@ -2,5 +2,6 @@
 
 `reader` opens a bag, `contents` lists what is in it, `plan` decides what each topic is used for, and `unpack` writes
 sweeps, photos, calibration and poses in the layout that `pipeline.importers.sweeps` reads. Messages are decoded by
-`point_cloud2`, `livox`, `images` and `cameras`; `transforms` chains frames, `poses` makes a trajectory.
+`point_cloud2`, `livox`, `images` and `cameras`; `transforms` chains frames, `clocks` compares time stamps,
+`poses` makes a trajectory of messages that `pose_messages` checks.
 """

@@ -47,7 +47,8 @@ class Contents:
             without messages that have no time stamp.
         link_lags: the same for moving transforms, by (parent, child).
         frames: all static transforms, and the moving ones of the first seconds.
-        samples: messages of kinds odometry, fix and imu in the first seconds, decoded, by topic.
+        samples: messages of kinds odometry, fix and imu in the first seconds, and of the latter two one in the middle,
+            decoded, by topic.
     """
 
     bag: Bag
@@ -102,9 +103,9 @@ def inspected(bag: Bag) -> Contents:
     found.frames.fix_constant()
     for name in known:
         if name not in found.first and name not in static:
-            for message in bag.messages([name]):
-                _sample(found, message)
-                break
+            _sample_one(found, name, 0.0)
+    for name in found.topics("fix", "imu"):  # a receiver or an INS may start later
+        _sample_one(found, name, 0.5)
     return found
 
 
@@ -161,6 +162,13 @@ def decode_sweep(bag: Bag, message: Message) -> RawSweep:
     if message.type in livox.TYPES:
         return livox.decode(message.raw, bag.ros2)
     return point_cloud2.decode(bag.decode(message))
+
+
+def _sample_one(found: Contents, topic: str, share: float) -> None:
+    """Keep what is needed of a topic's first message after a share of the recording."""
+    for message in found.bag.messages([topic], share=share):
+        _sample(found, message)
+        break
 
 
 def _sample(found: Contents, message: Message) -> None:

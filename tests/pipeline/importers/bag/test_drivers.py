@@ -131,6 +131,20 @@ def test_receiver_with_valid_and_exact_fixes_is_chosen(tmp_path: Path) -> None:
     assert planned(write(tmp_path / "bag", "mcap", gnss, others, points)).poses.topic == "/fix"
 
 
+def test_receiver_and_imu_that_start_late_are_used(tmp_path: Path) -> None:
+    def late(bag: BagFile, k: int, time: float) -> None:
+        if k >= 60:
+            gnss(bag, k // 10, time)
+            return
+        bag.fix("/fix", time, "antenna", (np.nan, np.nan, np.nan))
+        bag.imu("/imu", time, "base", np.eye(3))
+        if k == 0:
+            bag.transforms("/tf_static", time, [("base", "antenna", np.eye(4), time)])
+
+    plan = planned(write(tmp_path / "bag", "mcap", late, points, sweeps=120))
+    assert (plan.poses.kind, plan.warnings) == ("gnss", ())
+
+
 def test_gap_of_fixes_is_not_bridged_by_a_straight_line(tmp_path: Path) -> None:
     def tunnel(bag: BagFile, k: int, time: float) -> None:
         if 20 <= k < 60:
