@@ -137,7 +137,8 @@ def test_receiver_and_imu_that_start_late_are_used(tmp_path: Path) -> None:
             gnss(bag, k // 10, time)
             return
         bag.fix("/fix", time, "antenna", (np.nan, np.nan, np.nan))
-        bag.imu("/imu", time, "base", np.eye(3))
+        unknown = dict.fromkeys("xyzw", np.nan)
+        bag.write("/imu", "sensor_msgs/Imu", time, header=bag.header(time, "base"), orientation=unknown)
         if k == 0:
             bag.transforms("/tf_static", time, [("base", "antenna", np.eye(4), time)])
 
