@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -650,13 +650,22 @@ def plan_import(found: Contents, params: BagParams, intrinsics: Path | None = No
     return _Planner(found, params, intrinsics, urdf).plan()
 
 
-def described(found: Contents, params: BagParams, urdf: Path | None = None) -> tuple[dict[str, str], ScanError | None]:
-    """What each topic would be used for, and the error that would stop an import, or None."""
+class Description(NamedTuple):
+    """What each topic would be used for, warnings, and the error that would stop an import, or None."""
+
+    uses: dict[str, str]
+    warnings: tuple[str, ...]
+    error: ScanError | None
+
+
+def described(found: Contents, params: BagParams, urdf: Path | None = None) -> Description:
+    """What an import would do."""
     planner = _Planner(found, params, None, urdf)
     try:
-        return planner.plan().uses, None
+        plan = planner.plan()
     except ScanError as error:
-        return planner.all_uses(), error
+        return Description(planner.all_uses(), tuple(planner.warnings), error)
+    return Description(plan.uses, plan.warnings, None)
 
 
 def resolved(params: BagParams, plan: Plan) -> BagParams:

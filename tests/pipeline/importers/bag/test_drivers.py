@@ -49,7 +49,7 @@ def planned(path: Path, **params: Any) -> Plan:
 def uses_of(path: Path) -> dict[str, str]:
     """Use of each topic of a bag that can be imported."""
     with opened(path) as bag:
-        uses, error = described(inspected(bag), BagParams())
+        uses, _, error = described(inspected(bag), BagParams())
     assert error is None
     return uses
 

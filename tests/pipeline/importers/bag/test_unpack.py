@@ -160,7 +160,7 @@ def test_a_compressed_bag_that_is_larger_than_the_temporary_folder_is_reported(
 def test_pose_topics_are_used_only_if_chosen(tmp_path: Path, kind: str, form: str) -> None:
     path = write(bag_path(tmp_path, form), form, stamped(kind), points)
     with opened(path) as bag:
-        uses, _ = described(inspected(bag), BagParams())
+        uses, *_ = described(inspected(bag), BagParams())
     assert uses["/pose"] == "not used (--poses uses it)"
     found, notes = unpacked(path, tmp_path / "out", poses="/pose")
     assert found.poses is not None and notes == ["the poses of /pose are taken to be those of 'base' (--pose-frame)"]
@@ -202,7 +202,7 @@ def test_fixed_joints_of_a_urdf_complete_the_transforms(tmp_path: Path) -> None:
     assert found.photos is not None and notes == []
     assert np.allclose(read_rig(found.photos)[0].T_camera_scanner, np.linalg.inv(T_LIDAR_CAMERA))
     with opened(path) as bag:
-        uses, error = described(inspected(bag), BagParams(), robot)
+        uses, _, error = described(inspected(bag), BagParams(), robot)
     assert error is None and uses["/front/image_raw"].startswith("photos")
 
 
@@ -363,7 +363,7 @@ def test_defaults_skip_non_sensor_topics_with_a_reason(tmp_path: Path) -> None:
         bag.write("/chatter", "std_msgs/String", time, data="hello")
 
     with opened(write(tmp_path / "bag", "mcap", tf, camera, points, others)) as bag:
-        uses, error = described(inspected(bag), BagParams())
+        uses, _, error = described(inspected(bag), BagParams())
     assert error is None
     for topic, text in {
         "/points": "sweeps; frame lidar, points with times", "/cloud_map": "in the frame map",
@@ -394,7 +394,7 @@ def test_packets_and_videos_are_named_with_what_to_do(tmp_path: Path, form: str)
     packed = raw("/rear/points/draco", "point_cloud_interfaces/msg/CompressedPointCloud2")
     path = write(bag_path(tmp_path, form), form, tf, packets, packed, video)
     with opened(path) as bag:
-        uses, error = described(inspected(bag), BagParams())
+        uses, _, error = described(inspected(bag), BagParams())
     assert "raw packets of a lidar, whose driver makes PointCloud2" in uses["/velodyne_packets"]
     assert "republish it as CompressedImage" in uses["/front/video"]
     assert "republish them as PointCloud2" in uses["/rear/points/draco"]
