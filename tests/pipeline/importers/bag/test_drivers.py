@@ -86,6 +86,15 @@ def test_second_lidar_since_its_start_is_refused_unless_only_its_first_message_i
             planned(path)
 
 
+@pytest.mark.parametrize(("delay", "reported"), [(0.01, True), (0.12, False)])
+def test_points_that_are_later_than_their_recording_are_reported(tmp_path: Path, delay: float, reported: bool) -> None:
+    def late(bag: BagFile, k: int, time: float) -> None:
+        bag.cloud("/points", time, "lidar", records(XYZ, time=OFFSETS), log_s=time + delay)
+
+    _, notes = unpacked(write(tmp_path / "bag", "mcap", tf, late), tmp_path / "out")
+    assert [("0.09 s later than the recording" in note) for note in notes] == [True] * reported
+
+
 def raw_imu(bag: BagFile, k: int, time: float) -> None:
     """The IMU of a lidar under ROS 2: the driver leaves the orientation at the default of the message."""
     for i in range(5):
