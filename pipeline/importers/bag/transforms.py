@@ -198,7 +198,7 @@ class Frames:
 
     def parents(self, frame: str) -> list[str]:
         """Parents of a frame: one in a valid tree; those with most moving transforms first."""
-        links = [link for link in {**self.moving, **self.static} if link[1] == frame]
+        links = [link for link in dict.fromkeys([*self.moving, *self.static]) if link[1] == frame]
         return [parent for parent, _ in sorted(links, key=lambda link: -len(self.moving.get(link, ())))]
 
     def ancestors(self, frame: str, world: str | None = None) -> list[tuple[str, str]]:
