@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -17,9 +14,11 @@ from scan2sim.pipeline.core.parameters import Seconds
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers.bag import contents, images
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, camera_offset
+from scan2sim.pipeline.importers.bag.camera_topics import CameraTopics, base, rectified
+from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of
 from scan2sim.pipeline.importers.bag.clocks import check_clocks
 from scan2sim.pipeline.importers.bag.contents import Contents
+from scan2sim.pipeline.importers.bag.lidar_topics import LidarTopics
 from scan2sim.pipeline.importers.bag.point_cloud2 import InvalidCloud
 from scan2sim.pipeline.importers.bag.pose_messages import (
     fix_sigma,
@@ -29,22 +28,16 @@ from scan2sim.pipeline.importers.bag.pose_messages import (
     without_orientation,
 )
 from scan2sim.pipeline.importers.bag.reader import plain
-from scan2sim.pipeline.importers.bag.transforms import WORLD_FRAMES, earth_centred, without_turns
+from scan2sim.pipeline.importers.bag.transforms import BODY_FRAMES, WORLD_FRAMES, earth_centred, without_turns
 from scan2sim.pipeline.io import urdf as urdf_io
 from scan2sim.pipeline.io.calibration import read_camera
 
 AUTO, NONE, TF, GNSS, SWEEPS = "auto", "none", "tf", "gnss", "sweeps"
 MIN_FIX_RATE_HZ, MAX_FIX_SIGMA_M = 4.0, 0.5
 """GPS with an IMU places sweeps alone if it is at least that frequent and exact; otherwise it is fused with them."""
-BODY_FRAMES = ("base_link", "base_footprint", "base", "body")
-"""Names of the vehicle's frame (REP 105), the preferred one first."""
 NAMES_OF_IMAGES = ("image", "image_raw", "image_rect", "image_color", "image_rect_color", "image_mono", "raw")
 MIN_UNUSED_BITS = 2
 """Highest bits of 16-bit images that aren't used, from which a warning says so."""
-RECTIFIED = re.compile("rect|undist")
-"""Part of the name of a topic with images without distortion."""
-INFRARED = re.compile(r"(^|[/_])(infra\d?|infrared|ir|thermal)([/_]|$)")
-"""Part of the name of a topic with infrared images."""
 URDF_TOLERANCE = 0.005
 """Difference between a link of a URDF and that of the bag that is worth a warning: metres, and rotation elements."""
 LIST_TOPICS = "`scan2sim inspect` lists its topics"
@@ -53,13 +46,6 @@ LIDAR_PACKETS = (
     "NebulaPackets", "RslidarPacket", "RslidarScan", "LslidarPacket", "LslidarScan",
 )  # fmt: skip
 """Types, without their package, of a lidar's raw packets, which only its driver can decode."""
-RADAR_FIELD = re.compile("rcs|rcs_.*|.*_rcs|radar_?cross_?section|snr_db|v_?doppler_mps")
-"""Names of fields that only radars have."""
-DEPTH_CAMERA = "not used: points of a depth camera (--lidar uses it)"
-SAME_POINTS = 0.8
-"""Share of points from which two topics have the same ones, as whole sweeps and their segments."""
-MIN_SHARE_OF_SINGLE = 0.5
-"""Points of single lidars, as a share of those of a topic in the vehicle's frame, from which that one repeats them."""
 COMPRESSED_POINTS = "CompressedPointCloud2"
 """End of the types of compressed points (Draco, Cloudini, zstd), of `point_cloud_transport`."""
 VIDEOS = ("CompressedVideo", "FFMPEGPacket", "theora_image_transport/msg/Packet")
@@ -194,6 +180,11 @@ class _Planner:
     warnings: list[str] = field(default_factory=list)
 
     @property
+    def photos(self) -> CameraTopics:
+        """Topics of cameras."""
+        return CameraTopics(self.found, self.uses)
+
+    @property
     def path(self) -> Path:
         return self.found.bag.path
 
@@ -263,82 +254,14 @@ class _Planner:
         return tuple(lidars)
 
     def _default_lidars(self) -> list[str]:
-        """One topic of each frame, the best one; that with most points first."""
-        best: dict[str, str] = {}
-        odometries = {self.found.frame(topic) for topic in self.found.topics("odometry")}
-        moving = {parent for parent, _ in self.found.frames.moving}  # with joints of wheels, also the vehicle's frame
-        worlds = (moving | odometries | set(WORLD_FRAMES)) - set(BODY_FRAMES)
-        for topic in self.found.topics("lidar"):
-            sweep, frame = self.found.first[topic], self.found.frame(topic)
-            samples = self.found.samples.get(topic)
-            if isinstance(sweep, InvalidCloud):
-                self.uses[topic] = f"not used: {sweep}"
-            elif frame in worlds and not self.found.bag.topics[topic].type.startswith("livox"):
-                self.uses[topic] = f"not used: in the frame {frame}, not a lidar's (--lidar uses it)"
-            elif samples and sweep.rgb is not None and samples[0].height > 1:
-                self.uses[topic] = DEPTH_CAMERA
-            elif samples and _is_radar(topic, samples[0]):
-                self.uses[topic] = "not used: points of a radar (--lidar uses it)"
-            else:
-                old = best.setdefault(frame, topic)
-                if old != topic:
-                    loser, best[frame] = (old, topic) if self._better(topic, old) else (topic, old)
-                    self.uses[loser] = f"not used: of the same lidar as {best[frame]} (--lidar uses it)"
-        names = self._scanners(sorted(best.values(), key=lambda topic: -self._points(topic)))
-        if not names:
-            return []
-        first, *others = names
-        usable = [first]
-        for topic in others:
-            if self.found.frames.connected(self.found.frame(first), self.found.frame(topic)):
-                usable.append(topic)
-            else:
-                missing = f"no static transform to {self.found.frame(first)!r} from {self.found.frame(topic)!r}"
-                self.uses[topic] = f"not used: {missing} (--transform adds it)"
-                self.warnings.append(f"{topic} is left out: {missing}; give it with --transform")
-        return usable
-
-    def _scanners(self, topics: list[str]) -> list[str]:
-        """Topics without depth cameras, and without points of other topics in the vehicle's frame, if others remain."""
-        lidars = [topic for topic in topics if not self._by_depth_camera(topic)]
-        if lidars:
-            self.uses.update(dict.fromkeys((topic for topic in topics if topic not in lidars), DEPTH_CAMERA))
-            topics = lidars
-        single = [topic for topic in topics if self.found.frame(topic) not in BODY_FRAMES]
-        for topic in (topic for topic in topics if topic not in single):
-            near = [
-                one for one in single if self.found.frames.connected(self.found.frame(topic), self.found.frame(one))
-            ]
-            if sum(map(self._points, near)) > MIN_SHARE_OF_SINGLE * self._points(topic):
-                text = f"not used: probably the points of {', '.join(near)} in the vehicle's frame (--lidar uses it)"
-                self.uses[topic] = text
-                topics = [other for other in topics if other != topic]
-        return topics
-
-    def _better(self, topic: str, other: str) -> bool:
-        """Whether a topic of a lidar is better than another: times, more points, or as many in larger sweeps."""
-        timed = [self.found.first[name].time is not None for name in (topic, other)]
-        points = [self._points(name) for name in (topic, other)]
-        if timed[0] != timed[1]:
-            return timed[0]
-        if min(points) < SAME_POINTS * max(points):
-            return points[0] > points[1]
-        return len(self.found.first[topic]) > len(self.found.first[other])
-
-    def _points(self, topic: str) -> int:
-        """Number of points of a topic, by its first sweep."""
-        return len(self.found.first[topic]) * self.found.bag.topics[topic].count
-
-    def _by_depth_camera(self, topic: str) -> bool:
-        """Whether points without times have colours or are in the frame of a camera."""
-        sweep, frame = self.found.first[topic], self.found.frame(topic)
-        return sweep.time is None and (sweep.rgb is not None or frame.endswith(("optical_frame", "_optical")))
+        return LidarTopics(self.found, self.uses, self.warnings).chosen()
 
     def cameras(self, scanner: str) -> tuple[PhotoSource, ...]:
         given = self.params.camera
         if given == (NONE,):
             return ()
-        topics = [self._known(name, "--camera", "image", "compressed") for name in given] or self._default_cameras()
+        topics = [self._known(name, "--camera", "image", "compressed") for name in given]
+        topics = topics or self.photos.chosen(calibrated=self.intrinsics is not None)
         sources: list[PhotoSource] = []
         for topic in topics:
             frame = self.found.frame(topic)
@@ -355,78 +278,16 @@ class _Planner:
                     f"the first image of {topic} uses {16 - unused} of 16 bits: its photos are dark (have the driver "
                     "publish 8 bits, or 16 bits that are shifted)"
                 )
-            info = self._info(topic)
+            info = self.photos.info(topic)
             if info is not None and self.intrinsics is None:
                 self.uses[info] = f"calibration of {topic}"
         return tuple(sources)
 
-    def _default_cameras(self) -> list[str]:
-        """One topic of each camera: with most images, with colours, not rectified, not compressed.
-
-        Topics are of the same camera if they have the same CameraInfo, or images of the same size in the same frame
-        (drivers publish a camera's images several times). Grey infrared images are used if there are no others.
-        """
-        topics = []
-        for topic in self.found.topics("image", "compressed"):
-            if images.is_depth(self._encoding(topic)) or "compressedDepth" in topic:
-                self.uses[topic] = "not used: depth images"
-            elif self._info(topic) is None and self.intrinsics is None:
-                self.uses[topic] = "not used: no CameraInfo (--intrinsics gives its camera)"
-            else:
-                topics.append(topic)
-        topics = self._best_cameras(topics, lambda topic: self._info(topic) or topic)
-        topics = self._best_cameras(topics, self._frame_and_size)
-        infrared = [topic for topic in topics if INFRARED.search(topic) and not images.colours(self._encoding(topic))]
-        if len(infrared) < len(topics):
-            self.uses.update(dict.fromkeys(infrared, "not used: infrared images (--camera uses it)"))
-            topics = [topic for topic in topics if topic not in infrared]
-        return sorted(topics)
-
-    def _best_cameras(self, topics: list[str], key: Callable[[str], Any]) -> list[str]:
-        """Of topics of the same camera (the same `key`) the best one."""
-
-        def rank(topic: str) -> tuple[Any, ...]:
-            info = self._info(topic)
-            second = info is not None and camera_offset(self.found.first[info]) != 0
-            count, compressed = self.found.bag.topics[topic].count, self.found.kind(topic) == "compressed"
-            return not second, count, images.colours(self._encoding(topic)), not RECTIFIED.search(topic), not compressed
-
-        best: dict[Any, str] = {}
-        for topic in topics:
-            own = key(topic)
-            old = best.setdefault(own, topic)
-            if old != topic:
-                loser, best[own] = (old, topic) if rank(topic) > rank(old) else (topic, old)
-                self.uses[loser] = f"not used: of the same camera as {best[own]} (--camera uses it)"
-        return list(best.values())
-
-    def _encoding(self, topic: str) -> str:
-        """Encoding of a topic's images, or the format of compressed ones."""
-        first = self.found.first[topic]
-        return str(getattr(first, "encoding", "")) or str(getattr(first, "format", ""))
-
-    def _frame_and_size(self, topic: str) -> Any:
-        """Frame and size of a topic's images; the topic itself if they are unknown."""
-        frame = self.found.headers[topic].frame
-        with suppress(InputError):
-            return (frame, self._size(topic)) if frame else topic
-        return topic
-
-    def _info(self, topic: str) -> str | None:
-        """Topic of the CameraInfo of an image topic: beside it, else the only one in its frame."""
-        base = _base(topic)
-        beside = f"{base.rpartition('/')[0]}/camera_info"
-        infos = self.found.topics("info")
-        if beside in infos:
-            return beside
-        own = [name for name in infos if self.found.frame(name) == self.found.frame(topic)]
-        return own[0] if len(own) == 1 else None
-
     def _camera(self, topic: str) -> Camera:
-        width, height = self._size(topic)
+        width, height = self.photos.size(topic)
         if self.intrinsics is not None:
             return read_camera(self.intrinsics, width, height)
-        info = self._info(topic)
+        info = self.photos.info(topic)
         remedy = (
             "Give the camera with --intrinsics (a TOML file with [[cameras]] as in a tile), or choose topics with "
             "--camera (none: no photos)"
@@ -435,9 +296,7 @@ class _Planner:
             infos = ", ".join(self.found.topics("info")) or "none"
             raise InputError(self.path, f"has no CameraInfo of {topic} (it has {infos})", remedy)
         try:
-            camera = camera_of(
-                self.found.first[info], rectified=bool(RECTIFIED.search(_base(topic).rpartition("/")[2]))
-            )
+            camera = camera_of(self.found.first[info], rectified=rectified(topic))
         except InvalidCamera as error:
             raise InputError(self.path, f"the message of {info} {error}", remedy) from None
         if (camera.width, camera.height) == (width, height):
@@ -447,27 +306,6 @@ class _Planner:
             raise InputError(self.path, cause, remedy)
         self.warnings.append(f"{cause}: the calibration is scaled")
         return camera.resized(width, height)
-
-    def _size(self, topic: str) -> tuple[int, int]:
-        """Width and height of a topic's images, by the first one."""
-        import cv2
-
-        first = self.found.first[topic]
-        if self.found.kind(topic) == "image":
-            if not (first.width and first.height and len(first.data)):
-                raise self._no_image(topic, "has no data")
-            return int(first.width), int(first.height)
-        try:
-            _, content = images.compressed_file(first)
-        except images.InvalidImage as error:
-            raise self._no_image(topic, str(error)) from None
-        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        if pixels is None:
-            raise self._no_image(topic, "is a damaged image")
-        return int(pixels.shape[1]), int(pixels.shape[0])
-
-    def _no_image(self, topic: str, cause: str) -> InputError:
-        return InputError(self.path, f"the first image of {topic} {cause}", "Name other topics with --camera, or none")
 
     def poses(self, scanner: str) -> PoseSource:
         """Source of the scanner's poses.
@@ -692,24 +530,14 @@ def _unused(found: Contents, topic: str) -> str:
     return f"not used{reasons.get(found.kind(topic), '')}"
 
 
-def _is_radar(topic: str, cloud: Any) -> bool:
-    """Whether a PointCloud2 is a radar's: by its topic, or radar cross-sections."""
-    return "radar" in topic.lower() or any(RADAR_FIELD.fullmatch(field.name.lower()) for field in cloud.fields)
-
-
 def _is_packets(found: Contents, topic: str) -> bool:
     """Whether a topic has the raw packets of a lidar."""
     return found.bag.topics[topic].type.rpartition("/")[2] in LIDAR_PACKETS
 
 
-def _base(topic: str) -> str:
-    """Topic of the images without the suffix of its transport."""
-    return topic.removesuffix("/compressed")
-
-
 def _id(topic: str) -> str:
     """Name of a camera after its topic: /front/image_raw/compressed becomes "front"."""
-    parts = [part for part in _base(topic).split("/") if part]
+    parts = [part for part in base(topic).split("/") if part]
     while len(parts) > 1 and parts[-1] in NAMES_OF_IMAGES:
         parts.pop()
     return "_".join(parts) or "camera"

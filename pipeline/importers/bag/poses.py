@@ -10,10 +10,18 @@ from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.poses import interpolate
 from scan2sim.pipeline.core.types import F64, Trajectory
 from scan2sim.pipeline.importers.bag.contents import Contents, add_transforms, is_static
-from scan2sim.pipeline.importers.bag.plan import BODY_FRAMES, Plan
+from scan2sim.pipeline.importers.bag.plan import Plan
 from scan2sim.pipeline.importers.bag.pose_messages import fix_sigma, has_orientation, valid_fix
 from scan2sim.pipeline.importers.bag.reader import Bag, Message
-from scan2sim.pipeline.importers.bag.transforms import Frames, Series, earth_centred, in_gap, pose_matrix, without_turns
+from scan2sim.pipeline.importers.bag.transforms import (
+    BODY_FRAMES,
+    Frames,
+    Series,
+    earth_centred,
+    in_gap,
+    pose_matrix,
+    without_turns,
+)
 from scan2sim.pipeline.io.geodata import crs as crs_io
 
 MIN_POSE_INTERVAL_S = 0.0099

@@ -17,6 +17,8 @@ from scan2sim.pipeline.importers.bag.reader import plain
 
 WORLD_FRAMES = ("map", "world", "odom", "earth")
 """Names of frames that don't move with the vehicle (REP 105), the preferred one first."""
+BODY_FRAMES = ("base_link", "base_footprint", "base", "body")
+"""Names of the vehicle's frame (REP 105), the preferred one first."""
 CONSTANT = 1e-6
 """Largest change of a transform that never changes: metres, and elements of the rotation matrix."""
 EARTH_RADII_M, MAX_HEIGHT_M = (6.33e6, 6.42e6), 12_000.0

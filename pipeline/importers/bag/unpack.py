@@ -161,8 +161,8 @@ class _LidarDecoder:
         topic = self.lidar.topic
         if self._after and float(np.median(self._after)) > MAX_AFTER_S:
             return [
-                f"the last points of {topic} are {np.median(self._after):.2f} s later than the recording of their message: "
-                "its time stamp is probably that of the end of the sweep, or its clock is wrong"
+                f"the last points of {topic} are {np.median(self._after):.2f} s later than the recording of their "
+                "message: its time stamp is probably that of the end of the sweep, or its clock is wrong"
             ]
         if self.lidar.timed and self.unit is None:
             return [f"the times of the points of {topic} have no plausible unit: they are not used"]
