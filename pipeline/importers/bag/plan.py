@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers.bag import contents, images
 from scan2sim.pipeline.importers.bag.camera_topics import CameraTopics, base, rectified
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of
+from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, looks_rectified
 from scan2sim.pipeline.importers.bag.clocks import check_clocks
 from scan2sim.pipeline.importers.bag.contents import Contents
 from scan2sim.pipeline.importers.bag.lidar_topics import LidarTopics
@@ -299,6 +299,11 @@ class _Planner:
             camera = camera_of(self.found.first[info], rectified=rectified(topic))
         except InvalidCamera as error:
             raise InputError(self.path, f"the message of {info} {error}", remedy) from None
+        if not rectified(topic) and looks_rectified(self.found.first[info]):
+            self.warnings.append(
+                f"the images of {topic} seem to be rectified (K of {info} is off their middle, P isn't), but are taken as "
+                "raw: if they are rectified, give the camera of P with --intrinsics"
+            )
         if (camera.width, camera.height) == (width, height):
             return camera
         cause = f"the images of {topic} are {width}x{height}, those of {info} {camera.width}x{camera.height}"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.camera.models import project
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of
+from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, looks_rectified
 from scan2sim.pipeline.importers.bag.images import InvalidImage, compressed_file, raw_file
 
 RGB = np.zeros((16, 24, 3), np.uint8)
@@ -133,6 +133,20 @@ def test_rectified_images_have_the_intrinsics_of_p() -> None:
     assert (camera.model, camera.fx, camera.cx, camera.distortion) == ("pinhole", 350, 330, ())
     plain = camera_of(info("plumb_bob", [0.0] * 5), rectified=False)
     assert (plain.model, plain.fx, plain.cy) == ("pinhole", 400, 240)
+
+
+def test_camera_without_k_has_that_of_p() -> None:
+    camera = camera_of(info("", [], k=[0.0] * 9), rectified=False)
+    assert (camera.model, camera.fx, camera.cx, camera.distortion) == ("pinhole", 350, 330, ())
+
+
+def test_rectified_images_with_raw_intrinsics_are_recognized() -> None:
+    D, size = [-0.37, 0.2, 1e-3, 2e-3, -0.07], {"width": 1242, "height": 375}
+    K = [959.8, 0, 695.6, 0, 956.9, 224.2, 0, 0, 1]
+    P = [721.5, 0, 609.6, 44.9, 0, 721.5, 172.9, 0.2, 0, 0, 1, 0]
+    assert looks_rectified(info("plumb_bob", D, k=K, p=P, **size))
+    assert not looks_rectified(info("plumb_bob", D, k=K, p=P, width=1392, height=512))
+    assert not looks_rectified(info("plumb_bob", [0.0] * 5, k=P[:3] + P[4:7] + P[8:11], p=P, **size))
 
 
 def test_intrinsics_follow_binning_and_region_of_interest() -> None:
