@@ -301,8 +301,8 @@ class _Planner:
             raise InputError(self.path, f"the message of {info} {error}", remedy) from None
         if not rectified(topic) and looks_rectified(self.found.first[info]):
             self.warnings.append(
-                f"the images of {topic} seem to be rectified (K of {info} is off their middle, P isn't), but are taken as "
-                "raw: if they are rectified, give the camera of P with --intrinsics"
+                f"the images of {topic} seem to be rectified (K of {info} is off their middle, P isn't), but are taken "
+                "as raw: if they are rectified, give the camera of P with --intrinsics"
             )
         if (camera.width, camera.height) == (width, height):
             return camera
