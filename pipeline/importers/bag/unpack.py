@@ -113,6 +113,7 @@ class _LidarDecoder:
     """Decodes sweeps of one lidar; the unit of its times and intensities is recognized by its first sweeps."""
 
     lidar: Lidar
+    log_times: bool
     unit: TimeUnit | None = None
     scale: float | None = None
     _after: list[float] = field(default_factory=list)
@@ -150,9 +151,11 @@ class _LidarDecoder:
             farthest = float(np.abs(offsets).max())
             if farthest >= MAX_OFFSET_S:
                 raise InvalidCloud(f"has points whose times are {farthest:.1f} s from that of the message")
+            if self.log_times:
+                offsets -= offsets.max()  # a message is recorded after its last point
             times = time_ns * 1e-9 + offsets
             delay = (message.log_ns - stamp_ns) * 1e-9
-            if 0 < delay < MAX_OFFSET_S:  # 0: of a converted bag
+            if 0 < delay < MAX_OFFSET_S and not self.log_times:  # 0: of a converted bag
                 self._after.append(float(offsets.max()) - delay)
         return Sweep(xyz, intensity, raw.rgb, times)
 
@@ -264,7 +267,7 @@ def unpack(
             warn(text)
         log_times = params.stamps == "log"
         poses = PoseMessages.of(found, plan, log_times)
-        lidars = {lidar.topic: _LidarDecoder(lidar) for lidar in plan.lidars}
+        lidars = {lidar.topic: _LidarDecoder(lidar, log_times) for lidar in plan.lidars}
         cameras = {source.topic: source for source in plan.cameras}
         clocks = {topic: _Clock(bag, log_times) for topic in (*lidars, *cameras)}
         skipped, last_photo = _Skipped(), dict[str, int]()

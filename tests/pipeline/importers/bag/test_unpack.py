@@ -318,7 +318,10 @@ def test_recording_times_replace_those_of_headers(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"/points at 0\.100 s has no time stamp in its header.*--stamps log"):
         unpacked(path, tmp_path / "a")
     found, _ = unpacked(path, tmp_path / "b", stamps="log")
-    assert list_files(found.sweeps)[2].stem == "1700000000.200000000"
+    third = list_files(found.sweeps)[2]
+    times = read_sweep(third).time
+    assert third.stem == "1700000000.200000000" and times is not None
+    assert np.allclose(times, START + 0.2 + OFFSETS - PERIOD, atol=1e-6)  # it was recorded after its last point
 
 
 def test_transforms_repeated_by_ros_1_are_static(tmp_path: Path) -> None:
