@@ -16,6 +16,10 @@ MODELS: dict[str, CameraModel] = {
 LENGTHS: dict[CameraModel, tuple[int, ...]] = {"opencv": (4, 5, 8), "fisheye": (4,)}
 
 
+MAX_OFF_CENTRE = 0.05
+"""Largest usual distance of a principal point from the middle of the image, as a share of its width."""
+
+
 class InvalidCamera(Exception):
     """A CameraInfo from which no camera can be made; the text says why."""
 
@@ -25,13 +29,14 @@ def camera_of(info: Any, *, rectified: bool) -> Camera:
 
     Args:
         info: the message; of ROS 1 (fields D, K, P) or ROS 2 (d, k, p).
-        rectified: for a rectified image, whose intrinsics are those of P, without distortion.
+        rectified: for a rectified image, whose intrinsics are those of P, without distortion; as well if there is no K.
 
     Raises:
         InvalidCamera: it isn't calibrated, or its distortion model is unknown.
     """
     K, D, P = (np.asarray(_field(info, name), np.float64) for name in "kdp")
     name = str(info.distortion_model)
+    rectified = rectified or (not K[0] and P[0] > 0)
     width, height = int(info.width), int(info.height)
     fx, fy, cx, cy = (P[0], P[5], P[2], P[6]) if rectified and P[0] > 0 else (K[0], K[4], K[2], K[5])
     if not (width and height and np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0):
@@ -54,6 +59,24 @@ def camera_of(info: Any, *, rectified: bool) -> Camera:
     if wanted is None or not np.isfinite(D).all():
         raise InvalidCamera(f"has {len(D)} coefficients of the model {name!r}")
     return Camera(model, *size, float(fx), float(fy), float(cx), float(cy), tuple(float(d) for d in D[:wanted]))
+
+
+def looks_rectified(info: Any) -> bool:
+    """Whether the images of a `CameraInfo` with distortion have the size of rectified ones: by the principal points.
+
+    That of K is far from the middle then, that of P isn't (kitti2bag: rectified images with K and D of the raw ones).
+    """
+    K, D, P = (np.asarray(_field(info, name), np.float64) for name in "kdp")
+    if not (K[0] > 0 and P[0] > 0 and D.any()):
+        return False
+    middle = np.array([info.width, info.height]) / 2
+    raw, rectified = (float(np.linalg.norm(centre - middle)) for centre in (K[[2, 5]], P[[2, 6]]))
+    return raw > MAX_OFF_CENTRE * float(info.width) and rectified < raw / 2
+
+
+def camera_offset(info: Any) -> float:
+    """Offset of a camera from its frame by P of its `CameraInfo`: not 0 for the second camera of a stereo pair."""
+    return float(_field(info, "p")[3])
 
 
 def _field(info: Any, name: str) -> Any:
