@@ -72,10 +72,10 @@ class Classifier:
         import cv2
 
         if turns:
-            turned = replace(camera, width=rgb.shape[turns % 2 == 0], height=rgb.shape[turns % 2])
+            upright = np.ascontiguousarray(np.rot90(rgb, turns))
+            turned = replace(camera, width=upright.shape[1], height=upright.shape[0])
             channels = None if channels is None else np.rot90(channels, turns)
-            found = self.probabilities(np.ascontiguousarray(np.rot90(rgb, turns)), turned, channels)
-            return np.ascontiguousarray(np.rot90(found, -turns))
+            return np.ascontiguousarray(np.rot90(self.probabilities(upright, turned, channels), -turns))
         wide = camera.model == "equirectangular"
         size = self.size(camera)
         image = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if size[0] < camera.width else cv2.INTER_LINEAR)
