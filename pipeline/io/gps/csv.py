@@ -22,7 +22,7 @@ LONGITUDES = ("longitude", "lon", "lng", "long", "longitude_deg", "lon_deg")
 HEIGHTS = ("altitude", "alt", "ele", "elevation", "elev", "height", "altitude_m", "alt_m", "height_m", "elevation_m")
 SECONDS = {"ms": 1e-3, "millisecond": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "km": 1000.0}
-DEGREES = {unit: 180 / math.pi for unit in ("rad", "radian", "radians")}
+DEGREES = dict.fromkeys(("rad", "radian", "radians"), 180 / math.pi)
 """Units in brackets after the name of a column; others are seconds, metres and degrees."""
 
 
