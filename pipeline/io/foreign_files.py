@@ -29,13 +29,15 @@ KNOWN: dict[tuple[str, ...], tuple[str, str]] = {
         "a scan in its scanner's own format", _SCANNER,
     ),
     (".splat", ".ksplat", ".spz", ".sog", ".lcc"): ("a file of Gaussian splats", _SPLATS),
-    (".psx", ".psz", ".rcproj", ".rsproj", ".p4d", ".p4m", ".mvs", ".sfm"): (
+    (".psx", ".psz", ".rcproj", ".rsproj", ".p4d", ".p4m", ".opf", ".mvs", ".sfm"): (
         "the project of a photogrammetry program", _PROJECT,
     ),
     (".r3d",): ("a capture of Record3D", "Export it from the app as a point cloud (PLY), mesh or nerfstudio data set"),
     (".db",): (
         "a database, perhaps of RTAB-Map", "Export the cloud or mesh and the poses: `rtabmap-export map.db`",
     ),
+    (".srt",): ("a file of subtitles, in which drones of DJI log GPS", _GPX),
+    (".mrk",): ("a table of a DJI drone's exposures", "Use the GPS in the photos' EXIF, or write it as CSV"),
     (".kml", ".kmz", ".fit", ".tcx"): ("a track of another kind", _GPX),
     (".pos",): ("a solution of RTKLIB", "Write it as NMEA instead (`rnx2rtkp -n`; RTKPOST: output format NMEA0183)"),
     (".ubx", ".obs", ".rnx", ".nav", ".sbf", ".t02", ".t04", ".gpb"): ("raw GNSS data", _RAW),

@@ -22,7 +22,8 @@ LONGITUDES = ("longitude", "lon", "lng", "long", "longitude_deg", "lon_deg")
 HEIGHTS = ("altitude", "alt", "ele", "elevation", "elev", "height", "altitude_m", "alt_m", "height_m", "elevation_m")
 SECONDS = {"ms": 1e-3, "millisecond": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "ns": 1e-9}
 METRES = {"ft": 0.3048, "feet": 0.3048, "foot": 0.3048, "km": 1000.0}
-"""Units in brackets after the name of a column; others are seconds and metres."""
+DEGREES = dict.fromkeys(("rad", "radian", "radians"), 180 / math.pi)
+"""Units in brackets after the name of a column; others are seconds, metres and degrees."""
 
 
 def read(path: Path) -> GpsTrack:
@@ -69,7 +70,7 @@ def _read_table(path: Path) -> GpsTrack:
     finite = np.isfinite(data[:, 0])  # one time without a value must not hide the unit of the others
     data[finite, 0] = data[finite, 0] * unit if unit != 1 else seconds(data[finite, 0])
     if not local:
-        data[:, 3] *= _unit(height, METRES)
+        data[:, 1:4] *= [_unit(lat, DEGREES), _unit(lon, DEGREES), _unit(height, METRES)]
         return track_from_wgs84(path, data.tolist())
     data[:, 1:4] *= [_unit(name, METRES) for name in (x, y, z)]
     data = data[np.isfinite(data[:, :3]).all(axis=1) & ~np.isinf(data[:, 4])]

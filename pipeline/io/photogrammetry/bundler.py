@@ -10,7 +10,6 @@ Source: Bundler v0.4 user's manual (https://www.cs.cornell.edu/~snavely/bundler/
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
+from scan2sim.pipeline.io.trajectory_columns import is_number
 
 REMEDY = "Give Bundler's .out file (often bundle/bundle.out)"
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -102,7 +102,13 @@ def _names(path: Path) -> list[str]:
         raise InputError(
             candidates[0], "file not found: Bundler's cameras have no names", "Put the list of photos there"
         )
-    return [re.sub(r"(\s+[-+.\deE]+){1,2}$", "", line) for line in non_empty_lines(found)]
+    return [_without_number(_without_number(line)) for line in non_empty_lines(found)]
+
+
+def _without_number(line: str) -> str:
+    """A line without the number at its end, if it has one; names may contain blanks."""
+    words = line.rsplit(maxsplit=1)
+    return words[0] if len(words) > 1 and is_number(words[1]) else line
 
 
 def _camera(size: tuple[int, int], f: float, k1: float, k2: float) -> Camera:

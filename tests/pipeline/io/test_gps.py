@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from datetime import UTC, datetime
 from fractions import Fraction
@@ -110,6 +111,14 @@ def test_all_formats_give_the_same_track(tmp_path: Path, name: str, text: str, s
     true = Geod(ellps="WGS84").inv(LON, LAT, LON + ALONG[-1], LAT)[2]
     assert track.distance(track.times[:1], track.times[-1:])[0] == pytest.approx(np.hypot(true, 7), rel=5e-4)
     assert track.sigma is None if sigma is None else np.allclose(present(track.sigma), sigma)
+
+
+def test_radians_are_read_by_their_unit(tmp_path: Path) -> None:
+    rows = [f"{time},{math.radians(lat)!r},{math.radians(lon)!r},{height}" for time, lat, lon, height in points()]
+    (tmp_path / "a.csv").write_text("\n".join(["time [s],lat [rad],lon [rad],alt [m]", *rows]), encoding="utf-8")
+    (tmp_path / "b.csv").write_text(table("time,lat,lon,alt"), encoding="utf-8")
+    a, b = gps.read(tmp_path / "a.csv"), gps.read(tmp_path / "b.csv")
+    assert a.frame == b.frame and np.allclose(a.positions, b.positions, atol=1e-6)
 
 
 def test_local_metres_are_kept_unchanged(tmp_path: Path) -> None:
