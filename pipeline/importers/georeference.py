@@ -96,7 +96,8 @@ def _geographic(xyz: F64, datum: str | None) -> F64:
         axes = f"+a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
         degrees = "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
         to_degrees = Transformer.from_pipeline(f"+proj=pipeline +step +inv +proj=cart {axes} {degrees}")
-    lon, lat, height = to_degrees.transform(*xyz.T)
+    x, y, z = xyz.T
+    lon, lat, height = to_degrees.transform(x, y, z)
     return np.column_stack([lat, lon, height])
 
 

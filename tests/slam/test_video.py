@@ -33,9 +33,8 @@ def fisheyes(grey: U8) -> U8:
 def perspective(grey: U8) -> U8:
     """A quarter of a panorama, twice as wide as high."""
     height = grey.shape[0]
-    return cv2.resize(
-        grey[height // 3 : height // 3 + height // 4, height // 5 : height // 5 + height // 2], None, fx=4, fy=4
-    )  # type: ignore[call-overload, no-any-return]
+    part = grey[height // 3 : height // 3 + height // 4, height // 5 : height // 5 + height // 2]
+    return np.asarray(cv2.resize(part, (2 * height, height)), np.uint8)
 
 
 def test_panoramas_fisheye_pairs_and_perspective_frames_are_told_apart(corridor: Drive) -> None:
@@ -56,12 +55,10 @@ def test_camera_of_wide_frames_is_only_assumed_if_they_show_the_whole_sphere(cor
         camera_of_photos(tmp_path / "sphere"),
     ):
         assert camera is not None and camera.model == "equirectangular"
-    for ask in (
-        lambda: camera_of(open_video(tmp_path / "wide"), "auto", None, None),
-        lambda: camera_of_photos(tmp_path / "wide"),
-    ):
-        with pytest.raises(InputError, match=r"edges don't meet.*--camera pinhole"):
-            ask()
+    with pytest.raises(InputError, match=r"edges don't meet.*--camera pinhole"):
+        camera_of(open_video(tmp_path / "wide"), "auto", None, None)
+    with pytest.raises(InputError, match=r"edges don't meet.*--camera pinhole"):
+        camera_of_photos(tmp_path / "wide")
     cv2.imwrite(str(tmp_path / "wide" / "0.png"), fisheyes(corridor.greys[0]))
     with pytest.raises(InputError, match=r"two fisheye circles.*Export a 360"):
         camera_of(open_video(tmp_path / "wide"), "auto", None, None)

@@ -203,7 +203,8 @@ class _Planner:
     def _check_clocks(
         self, lidars: tuple[Lidar, ...], cameras: tuple[PhotoSource, ...], poses: PoseSource, gps: str
     ) -> None:
-        others = [*(one.topic for one in (*lidars[1:], *cameras)), *filter(None, (poses.topic, poses.imu, gps))]
+        others = [one.topic for one in lidars[1:]] + [one.topic for one in cameras]
+        others += filter(None, (poses.topic, poses.imu, gps))
         frames = self.found.frames
         above = frames.ancestors(lidars[0].frame, poses.world) if poses.kind == "tf" else []
         check_clocks(self.found, lidars[0].topic, others, [link for link in above if link in frames.moving])
