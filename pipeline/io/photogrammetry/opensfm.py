@@ -5,7 +5,7 @@ middle of the image, its longer side has length 1. The world is topocentric: met
 `reference_lla`. It is transformed to a projected CRS: that of the ODM project (`coords.txt`), or UTM.
 
 ODM renames that file to `reconstruction.topocentric.json`, and its `reconstruction.json` is in the project's CRS
-minus the offset of `coords.txt`: turned by the meridian convergence, and up to a metre off. The former is read.
+minus the offset of `coords.txt`: turned by the meridian convergence, and shifted. The former is read.
 
 Source: OpenSfM's documentation (https://opensfm.org/docs/geometry.html, dataset.html) and its
 `opensfm/src/geometry/camera_distortions_functions.h`; its Brown model has OpenCV's order of coefficients. ODM's
