@@ -63,7 +63,7 @@ def compressed_file(image: Any) -> tuple[str, bytes]:
 def _bayer_pattern(kind: str) -> str:
     """Bayer pattern of a `CompressedImage` with the `format` `kind`; "" if its pixels aren't raw.
 
-    `compressed_image_transport` doesn't convert Bayer images ("bayer_rggb8; jpeg compressed "), or to grey ("mono8").
+    compressed_image_transport doesn't convert Bayer images ("bayer_rggb8; jpeg compressed "), or to grey ("mono8").
     """
     encoding, _, stored = kind.lower().partition(";")
     raw = encoding.startswith("bayer_") and not any(name in stored for name in ("mono", "bgr", "rgb8", "rgb16"))

@@ -35,7 +35,7 @@ def test_files_of_other_programs_are_named(
     with pytest.raises(InputError, match=message):
         read(tmp_path / name)
     shown = CliRunner().invoke(app, ["inspect", str(tmp_path / name)])
-    assert shown.exit_code == 3
+    assert isinstance(shown.exception, InputError)
 
 
 def test_a_missing_file_is_not_taken_for_a_foreign_one(tmp_path: Path) -> None:
