@@ -9,7 +9,7 @@ minus the offset of `coords.txt`: turned by the meridian convergence, and shifte
 
 Source: OpenSfM's documentation (https://opensfm.org/docs/geometry.html, dataset.html) and its
 `opensfm/src/geometry/camera_distortions_functions.h`; its Brown model has OpenCV's order of coefficients. ODM's
-`stages/run_opensfm.py` and `export_geocoords` of its OpenSfM.
+`stages/run_opensfm.py` and the command export_geocoords of its OpenSfM.
 """
 
 from __future__ import annotations
