@@ -39,7 +39,7 @@ from scan2sim.pipeline.importers import foreign_tables
 from scan2sim.pipeline.importers.path_correction import PathCorrection, read_correction, write_corrected
 from scan2sim.pipeline.importers.photo_fit import fitted_cameras
 from scan2sim.pipeline.io import clouds as cloud_io
-from scan2sim.pipeline.io import tables
+from scan2sim.pipeline.io import sbet, tables
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io import trajectory_check as check_io
 from scan2sim.pipeline.io.clouds import las
@@ -264,16 +264,16 @@ def _corrected_path(
     trajectory: Path | None, check: Path | None, frame: Frame
 ) -> tuple[Trajectory | None, PathCorrection | None]:
     """The trajectory (metres), if it differs from its file: in the clouds' clock, corrected; and its correction."""
-    if trajectory is None or check is None:
+    if trajectory is None or (check is None and not sbet.is_sbet(trajectory)):
         return None, None
-    found = check_io.read(check) or {}
+    found = (None if check is None else check_io.read(check)) or {}
     offset = float(found.get("clock_offset_s", 0.0))
     path = trajectory_io.read(trajectory, frame, ordered=False, timed=True)
     path = replace(path, times=path.times + offset)
-    correction = read_correction(check, path)
+    correction = None if check is None else read_correction(check, path)
     if correction is not None:
         return correction.trajectory(), correction
-    return (path if offset else None), None
+    return (path if offset or sbet.is_sbet(trajectory) else None), None
 
 
 def _add_trajectory(trajectory: Path, path: Trajectory | None, folder: Path, frame: Frame, link: bool) -> str:

@@ -41,7 +41,7 @@ KNOWN: dict[tuple[str, ...], tuple[str, str]] = {
     (".kml", ".kmz", ".fit", ".tcx"): ("a track of another kind", _GPX),
     (".pos",): ("a solution of RTKLIB", "Write it as NMEA instead (`rnx2rtkp -n`; RTKPOST: output format NMEA0183)"),
     (".ubx", ".obs", ".rnx", ".nav", ".sbf", ".t02", ".t04", ".gpb"): ("raw GNSS data", _RAW),
-    (".out", ".sbet", ".smrmsg", ".traj", ".pof", ".trj"): ("perhaps a trajectory (SBET, POF)", _PATH),
+    (".out", ".sbet", ".smrmsg", ".traj", ".pof", ".trj"): ("perhaps a damaged trajectory (SBET, POF)", _PATH),
     (".insv", ".insp"): ("a recording of Insta360", "Stitch and export it as MP4 or JPEG, with its GPS as GPX"),
     (".zip", ".7z", ".rar", ".gz", ".tgz", ".tar"): ("an archive", "Unpack it first"),
 }  # fmt: skip

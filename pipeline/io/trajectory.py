@@ -5,6 +5,7 @@
 | .csv | a header line, then time,x,y,z[,qx,qy,qz,qw][,unsure][,sx,sy,sz[,srx,sry,srz]]: all but correlations; tables of other programs, with or without a header line (`trajectory_columns`) |
 | .tum | time x y z qx qy qz qw per line, the format of the TUM benchmark and evo |
 | .kitti | 12 numbers per line, row-major 3x4; ten poses per second unless times are given |
+| .out, .sbet | SBET of a GNSS/INS, projected to the CRS; read-only (`pipeline.io.sbet`) |
 | .geojson | the path in WGS84, and a point for each unsure section; write-only |
 
 Quaternions rotate sensor axes to world axes, scalar last. `sx` to `sz` are standard deviations in the CRS's unit,
@@ -28,7 +29,7 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError, from_os_error
 from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import F64, Frame, Trajectory
-from scan2sim.pipeline.io import file_checks, foreign_files, tables
+from scan2sim.pipeline.io import file_checks, foreign_files, sbet, tables
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.trajectory_columns import MATRIX, UNNAMED, is_number, named, seconds, unnamed
 
@@ -65,6 +66,8 @@ def read(
         InputError: unreadable, empty, NaN, wrong columns, times out of order, invalid rotation; names file and line.
     """
     frame = frame or Frame()
+    if sbet.is_sbet(path):
+        return sbet.read(path, frame)
     kind, lines = _lines(path)
     if kind == ".kitti":
         if timed and times is None:

@@ -25,7 +25,7 @@ from scan2sim.pipeline.io import clouds, foreign_files, gps, mesh_files, mesh_mo
         ("a.fbx", mesh_models.read, r"a mesh or scene.*as GLB, or as OBJ"),
         ("a.pos", gps.read, r"unknown GPS format: \.pos is a solution of RTKLIB.*NMEA"),
         ("a.kml", gps.read, r"Export the recorded track as GPX"),
-        ("sbet.out", trajectory.read, r"not a text file: \.out is perhaps a trajectory \(SBET.*as text"),
+        ("sbet.out", trajectory.read, r"not a text file: \.out is perhaps a damaged trajectory \(SBET.*as text"),
     ],
 )
 def test_files_of_other_programs_are_named(
