@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,6 +39,30 @@ def is_sbet(path: Path) -> bool:
     return bool(_plausible(np.fromfile(path, "<f8", FIELDS)[None]).all())
 
 
+class Description(NamedTuple):
+    """What an SBET file contains: number and rate of its records; ranges of seconds, degrees and metres."""
+
+    records: int
+    rate_hz: float
+    times: tuple[float, float]
+    latitude: tuple[float, float]
+    longitude: tuple[float, float]
+    height: tuple[float, float]
+
+
+def describe(path: Path) -> Description:
+    """What a file contains for which `is_sbet` is true.
+
+    Raises:
+        InputError: records are damaged.
+    """
+    rows = _records(path)
+    shown = rows[:, :4] * [1, math.degrees(1), math.degrees(1), 1]
+    ranges = zip(shown.min(axis=0).tolist(), shown.max(axis=0).tolist(), strict=True)
+    times, latitude, longitude, height = ranges
+    return Description(len(rows), 1 / _interval(rows), times, latitude, longitude, height)
+
+
 def read(path: Path, frame: Frame) -> Trajectory:
     """Read an SBET file: positions local to `frame`, rotations from a body's axes (x ahead, y left, z up) to grid axes.
 
@@ -52,17 +77,27 @@ def read(path: Path, frame: Frame) -> Trajectory:
     """
     if frame.crs == crs_io.LOCAL:
         raise InputError(path, "has positions in degrees, which need a CRS", "Give that of the clouds: --crs EPSG:...")
-    rows = np.fromfile(path, "<f8").reshape(-1, FIELDS)
-    odd = np.flatnonzero(~_plausible(rows))
-    if len(odd):
-        raise InputError(path, f"is damaged at record {odd[0] + 1} of {len(rows)}", REMEDY)
-    step = np.median(np.diff(rows[:, 0])) if len(rows) > 1 else 1.0
-    rows = rows[:: max(1, round(1 / (RATE_HZ * max(step, 1e-6))))]
+    rows = _records(path)
+    rows = rows[:: max(1, round(1 / (RATE_HZ * _interval(rows))))]
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
     latitude, longitude = np.degrees(rows[:, 1]), np.degrees(rows[:, 2])
     xy, convergence = _projected(latitude, longitude, frame.crs)
     positions = frame.to_local(np.column_stack([xy, rows[:, 3]]) / frame.unit)
     return Trajectory(rows[:, 0], positions, _rotations(rows, convergence))
+
+
+def _records(path: Path) -> F64:
+    """All records (T, 17)."""
+    rows = np.fromfile(path, "<f8").reshape(-1, FIELDS)
+    odd = np.flatnonzero(~_plausible(rows))
+    if len(odd):
+        raise InputError(path, f"is damaged at record {odd[0] + 1} of {len(rows)}", REMEDY)
+    return rows
+
+
+def _interval(rows: F64) -> float:
+    """Seconds between records, 1 of a single one."""
+    return max(float(np.median(np.diff(rows[:, 0]))), 1e-6) if len(rows) > 1 else 1.0
 
 
 def _plausible(rows: F64) -> Bools:

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from scan2sim.flows.cli import app
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Frame
 from scan2sim.pipeline.io import sbet, trajectory
@@ -54,6 +56,15 @@ def test_high_rates_are_thinned(tmp_path: Path) -> None:
     write(tmp_path / "a.out", CRS, times, poses)
     path = trajectory.read(tmp_path / "a.out", Frame(CRS))
     assert np.allclose(np.diff(path.times), 1 / sbet.RATE_HZ)
+
+
+def test_inspect_says_what_the_file_is_and_where(tmp_path: Path) -> None:
+    times, poses = drive(200.0)
+    write(tmp_path / "a.out", CRS, times, poses)
+    shown = CliRunner().invoke(app, ["inspect", str(tmp_path / "a.out")])
+    assert shown.exit_code == 0, shown.output
+    for text in ("SBET trajectory", "800 at 200 Hz", "48.7", "11.7", "300.0 to 302.0", "--trajectory"):
+        assert text in shown.output
 
 
 def test_what_is_no_sbet_file_or_damaged_is_refused(tmp_path: Path) -> None:
