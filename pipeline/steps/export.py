@@ -155,4 +155,4 @@ def can_export(params: ExportParams) -> None:
         require("export.rasters", "rasterio")
 
 
-EXPORT = Step("export", 11, export, ExportParams, check=can_export)
+EXPORT = Step("export", 12, export, ExportParams, check=can_export)

@@ -293,6 +293,11 @@ class Scene:
         return any(tile.splat_count for tile in self.tiles)
 
     @property
+    def has_backdrop(self) -> bool:
+        """Whether a tile, or the dome, shows more to cameras than was scanned."""
+        return any((tile.folder / BACKDROP).is_dir() for tile in self.with_dome)
+
+    @property
     def with_dome(self) -> tuple[SceneTile, ...]:
         """All tiles, and the dome, if there is one: what cameras see."""
         return self.tiles if self.dome is None else (*self.tiles, self.dome)
