@@ -42,9 +42,9 @@ TERRAIN_NAME = "Terrain"
 PROP_TAGS = {
     CODE["building"]: "Building", CODE["tower"]: "Building", CODE["wall_or_fence"]: "Wall", CODE["pole"]: "Pole",
     CODE["road_sign"]: "TrafficSign", CODE["low_vegetation"]: "Vegetation", CODE["mid_vegetation"]: "Vegetation",
-    CODE["high_vegetation"]: "Vegetation", CODE["vehicle"]: "Vehicles",
+    CODE["high_vegetation"]: "Vegetation", CODE["vehicle"]: "Car",
 }  # fmt: skip
-"""Semantic tags of props; CARLA labels assets by the folder of that name."""
+"""Semantic tags of props; CARLA labels assets by the folder of that name, and gives others no label (`Tagger.cpp`)."""
 DEFAULT_TAG = "Static"
 
 

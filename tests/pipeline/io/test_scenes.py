@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,7 @@ from scan2sim.pipeline.core.errors import InputError, ScanError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io import world_formats
-from scan2sim.pipeline.io.world_formats import SceneParams, gazebo
+from scan2sim.pipeline.io.world_formats import SceneParams, carla, gazebo
 from scan2sim.pipeline.io.worlds import readme
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene
 from tests.fakes import synthetic
@@ -265,6 +268,17 @@ def test_carla_names_carry_semantic_tags(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_carla_knows_the_tags() -> None:
+    # ATagger::GetLabelByFolderName of CARLA 0.9.15; a folder with another name has no label
+    labels = {
+        "Building", "Fence", "Pedestrian", "Pole", "Other", "Road", "RoadLine", "SideWalk", "TrafficSign", "Vegetation",
+        "Car", "Wall", "Sky", "Ground", "Bridge", "RailTrack", "GuardRail", "TrafficLight", "Static", "Dynamic",
+        "Water", "Terrain", "Truck", "Motorcycle", "Bicycle", "Bus", "Rider", "Train",
+    }  # fmt: skip
+    assert {*carla.PROP_TAGS.values(), carla.DEFAULT_TAG} <= labels
+    assert carla.PROP_TAGS[CODE["vehicle"]] == "Car"
+
+
 def test_large_ground_is_split_into_carla_map_tiles_from_the_north_west(tmp_path: Path) -> None:
     town = synthetic.scene(tmp_path, apart=3000.0)
     written(town, "carla", tmp_path / "out")
@@ -273,6 +287,18 @@ def test_large_ground_is_split_into_carla_map_tiles_from_the_north_west(tmp_path
     (name, corners, _, picture), *_ = fbx(tmp_path / "out" / "carla" / "town" / "town_Tile_1_0.fbx")
     assert name.startswith("town_Terrain_tile1") and corners[..., 0].min() == pytest.approx(2990, abs=0.01)
     assert picture.parent.name == "town_Tile_1_0.fbm" and picture.is_file()
+
+
+def test_usd_files_have_a_version_that_isaac_sim_4_reads(tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    code = (
+        "from pathlib import Path; from scan2sim.pipeline.io.world_formats import usd; "
+        "usd._stage(Path('a.usdc')).GetRootLayer().Save()"
+    )
+    mine = {name: value for name, value in os.environ.items() if not name.startswith("USD_")}
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, env=mine)  # OpenUSD reads its settings once
+    head = (tmp_path / "a.usdc").read_bytes()
+    assert head[:8] == b"PXR-USDC" and tuple(head[8:11]) <= (0, 9, 0)
 
 
 def test_usd_contains_photo_and_distance_of_each_face(town: Scene, exported: dict[str, Path]) -> None:
