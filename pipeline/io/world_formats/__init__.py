@@ -53,6 +53,8 @@ class SceneParams(GlbParams):
         source_pages: write a mask for each of these pages with the source of each texel's colour: 255 a photo, 128
             the cloud's points, 64 inpainted, 0 no surface.
         ceiling: ceilings of indoor maps: a model of their own, or left out.
+        backdrop: the backdrop, if there is one, is part of the world (Gazebo, GLB, USD). Gazebo's depth and RGB-D
+            cameras, which can't ignore it as its lidars can, need worlds without it.
     """
 
     meshes: tuple[str, ...] = Field(
@@ -75,6 +77,7 @@ class SceneParams(GlbParams):
         "removed), or hidden.",
     )
     source_pages: bool = Field(False, description="Write a mask for each texture page with the source of colours.")
+    backdrop: bool = Field(True, description="Write the backdrop, if there is one (Gazebo, GLB, USD).")
 
 
 class Format(Protocol):
@@ -143,6 +146,9 @@ def write(
     check(formats, params, "export.formats", robot)
     if params.ceiling == "hidden":
         scene = replace(scene, tiles=tuple(map(_without_ceiling, scene.tiles)))
+    if not params.backdrop:
+        tiles = tuple(replace(tile, shows_backdrop=False) for tile in scene.tiles)
+        scene = replace(scene, tiles=tiles, dome=None)
     if robot:
         _check_names(scene)
         scene = replace(scene, start=find_spawn_pose(scene))

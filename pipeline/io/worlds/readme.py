@@ -65,12 +65,13 @@ def _sensors(scene: Scene, formats: Sequence[str]) -> list[str]:
     far = max(CAMERA_FAR_M, ceil(scene.far or 0))
     lines = [
         f"Around the scan there are scenery and a sky for cameras, whose far clipping distance must be {far} m. "
-        "Lidars and depth cameras would measure them:\n"
+        "Lidars and depth cameras would measure them as well:\n"
     ]
     if "gazebo" in formats:
         lines.append(
-            f"- Gazebo: add `<visibility_mask>{sdf.WITHOUT_BACKDROP}</visibility_mask>` to `<lidar>`, and to "
-            f"`<camera>` of depth cameras; `<clip><far>{far}</far></clip>` to `<camera>` of the others.\n"
+            f"- Gazebo: add `<visibility_mask>{sdf.WITHOUT_BACKDROP}</visibility_mask>` to `<lidar>`, and "
+            f"`<clip><far>{far}</far></clip>` to `<camera>`. Depth and RGB-D cameras ignore masks: for these, export "
+            "the world with `--no-backdrop`.\n"
         )
     if "usd" in formats:
         lines.append("- USD: deactivate the prims `Backdrop` for them.\n")

@@ -16,8 +16,9 @@ Design decisions:
 - Every visual has the LAS code of its class as label for Gazebo's segmentation cameras.
 - `<laser_retro>` of a visual is what the sensor `gpu_lidar` returns as intensity, at every range and angle: 255 times
   the reflectance, the scale of 8-bit lidars (Gazebo accepts 0 to 2000). Without it intensities are 0.
-- The backdrop is what only cameras see. Its visuals have the visibility flag `BACKDROP_FLAG`; lidars and depth cameras
-  need the mask `WITHOUT_BACKDROP`, which the robot's lidar has.
+- The backdrop is what only cameras see. Its visuals have the visibility flag `BACKDROP_FLAG`; lidars need the mask
+  `WITHOUT_BACKDROP`, which the robot's has. Depth and RGB-D cameras ignore masks (`Ogre2DepthCamera.cc` of gz-rendering
+  6 to 10): they need a world without it (`export.backdrop`).
 - Gazebo loads a level when the performer's box intersects the level's box, and unloads it when the
   performer is `<buffer>` away from it (gz-sim #28: the buffer has no effect on loading). Therefore a
   level's box is larger than its tile; otherwise a robot would see a tile only when standing on it.

@@ -105,6 +105,17 @@ def test_readme_says_how_to_open_every_format(tmp_path: Path) -> None:
     assert command in (tmp_path / "README.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize("name", ["gazebo", "glb", "usd"])
+def test_backdrop_can_be_omitted_for_depth_cameras(town: Scene, tmp_path: Path, name: str) -> None:
+    if missing := plugins.missing(world_formats.PACKAGE, name):
+        pytest.skip(f"{missing} is not installed")
+    world_formats.write(town, [name], tmp_path / "out", SceneParams(backdrop=False), silent)
+    assert not list((tmp_path / "out").rglob("backdrop*"))
+    assert max(np.abs(part.corners).max() for part in READERS[name](tmp_path / "out", town)) < 55
+    assert "visibility_mask" not in (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
+    assert town.has_backdrop
+
+
 @pytest.mark.parametrize("name", ["glb", "usd"])
 def test_visual_formats_contain_the_backdrop(town: Scene, tmp_path: Path, name: str) -> None:
     out = exported(town, name, tmp_path / "out")
