@@ -312,11 +312,11 @@ def sky_metadata(scene: Scene) -> dict[str, Any]:
     return colour | ({"camera_far_m": ceil(scene.far)} if scene.far else {})
 
 
-def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams) -> PageNames:
-    """Write a group's texture pages into `folder`; returns their names."""
+def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams, prefix: str = "") -> PageNames:
+    """Write a group's texture pages into `folder`; returns their names. `prefix` is that of the images' names."""
     make_folder(folder)
     materials = tuple(f"{group}_{page}" for page in range(len(shape.pages)))
-    images = tuple(f"{name}.{'png' if params.pages == 'png' else 'jpg'}" for name in materials)
+    images = tuple(f"{prefix}{name}.{'png' if params.pages == 'png' else 'jpg'}" for name in materials)
     for page in shape.used_pages:
         if params.pages == "png":
             shutil.copyfile(shape.pages[page], folder / images[page])  # a copy, not a link: users may edit it

@@ -268,6 +268,13 @@ def test_carla_names_carry_semantic_tags(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_no_two_textures_of_gazebos_world_have_the_same_file_name(tmp_path: Path) -> None:
+    # gz-rendering #139: the second would show the first
+    written(synthetic.scene(tmp_path), "gazebo", tmp_path / "out")
+    names = [path.name for path in (tmp_path / "out").rglob("*.png")]
+    assert len(names) == len(set(names)) and len(names) >= 8  # two tiles, two surfaces, two pages
+
+
 def test_carla_knows_the_tags() -> None:
     # ATagger::GetLabelByFolderName of CARLA 0.9.15; a folder with another name has no label
     labels = {
