@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from math import ceil
 from pathlib import Path
 
+from scan2sim.pipeline.io.geodata.crs import LOCAL
 from scan2sim.pipeline.io.worlds import sdf
 from scan2sim.pipeline.io.worlds.scene import Scene
 
@@ -40,7 +41,7 @@ def write(folder: Path, scene: Scene, formats: Sequence[str]) -> None:
         parts.append("In other programs, in this folder:\n\n" + "".join(others))
     parts += _placing(scene, formats)
     parts += _sensors(scene, formats)
-    parts.append(_coordinates(scene))
+    parts.append(_coordinates(scene, formats))
     (folder / FILE).write_text("\n".join(parts), encoding="utf-8")
 
 
@@ -54,7 +55,11 @@ def _placing(scene: Scene, formats: Sequence[str]) -> list[str]:
         "(`spawn` in metadata.json): free ground, 2 cm below."
     )
     if "gazebo" in formats:
-        text += f" While Gazebo runs:\n\n    {sdf.spawn_command(scene.spawn)}\n"
+        text += (
+            f" While Gazebo runs:\n\n    {sdf.spawn_command(scene.spawn)}\n\n"
+            "ROBOT.sdf may be a URDF, too; `-topic robot_description` in place of `-file ROBOT.sdf` takes the URDF that "
+            "robot_state_publisher publishes.\n"
+        )
     return [text.rstrip("\n") + "\n"]
 
 
@@ -78,11 +83,17 @@ def _sensors(scene: Scene, formats: Sequence[str]) -> list[str]:
     return [lines[0] + "\n" + "".join(lines[1:])]
 
 
-def _coordinates(scene: Scene) -> str:
+def _coordinates(scene: Scene, formats: Sequence[str]) -> str:
     """What its coordinates are."""
     x, y, z = scene.origin
-    where = "a local frame" if scene.frame.crs == "local" else scene.frame.crs
-    return (
-        f"Coordinates are metres, z up; x = y = z = 0 is ({x:.10g}, {y:.10g}, {z:.10g}) m in {where} "
-        "(`world_origin_m` in metadata.json, which has the rest).\n"
+    is_local = scene.frame.crs == LOCAL
+    text = (
+        f"Coordinates are metres, z up; x = y = z = 0 is ({x:.10g}, {y:.10g}, {z:.10g}) m in "
+        f"{'a local frame' if is_local else scene.frame.crs} (`world_origin_m` in metadata.json, which has the rest).\n"
     )
+    if is_local and "gazebo" in formats:
+        text += (
+            "Its place on the earth isn't known: in Gazebo, NavSat sensors publish nothing, nor magnetometers from "
+            "Harmonic on, unless you add `<spherical_coordinates>` to the world.\n"
+        )
+    return text

@@ -12,7 +12,7 @@ import pytest
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.step import silent
-from scan2sim.pipeline.core.types import Mesh
+from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io import robot_formats, world_formats
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.world_formats import SceneParams
@@ -101,6 +101,9 @@ def test_readme_says_how_to_open_every_format(tmp_path: Path) -> None:
         text = (tmp_path / "README.md").read_text(encoding="utf-8")
         assert "in this folder" in text and "{" not in text, name
     readme.write(tmp_path, scene, ["gazebo"])
+    assert "NavSat" not in (tmp_path / "README.md").read_text(encoding="utf-8")
+    readme.write(tmp_path, replace(scene, frame=Frame()), ["gazebo"])
+    assert "NavSat sensors publish nothing" in (tmp_path / "README.md").read_text(encoding="utf-8")
     command = f"GZ_SIM_RESOURCE_PATH=$PWD/models:$GZ_SIM_RESOURCE_PATH gz sim -r {scene.name}.sdf"
     assert command in (tmp_path / "README.md").read_text(encoding="utf-8")
 
