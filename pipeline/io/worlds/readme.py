@@ -57,8 +57,8 @@ def _placing(scene: Scene, formats: Sequence[str]) -> list[str]:
     if "gazebo" in formats:
         text += (
             f" While Gazebo runs:\n\n    {sdf.spawn_command(scene.spawn)}\n\n"
-            "ROBOT.sdf may be a URDF, too; `-topic robot_description` in place of `-file ROBOT.sdf` takes the URDF that "
-            "robot_state_publisher publishes.\n"
+            "ROBOT.sdf may be a URDF, too; `-topic robot_description` in place of `-file ROBOT.sdf` takes the URDF "
+            "that robot_state_publisher publishes.\n"
         )
     return [text.rstrip("\n") + "\n"]
 
