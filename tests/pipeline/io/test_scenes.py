@@ -289,7 +289,11 @@ def test_carla_knows_the_tags() -> None:
 def test_large_ground_is_split_into_carla_map_tiles_from_the_north_west(tmp_path: Path) -> None:
     town = synthetic.scene(tmp_path, apart=3000.0)
     written(town, "carla", tmp_path / "out")
-    (about,) = json.loads((tmp_path / "out" / "carla" / "town.json").read_text(encoding="utf-8"))["maps"]
+    folder = tmp_path / "out" / "carla"
+    package, props = (json.loads((folder / f"{name}.json").read_text("utf-8")) for name in ("town", "town_props"))
+    # Import.py makes vertices of all files of a package with tiles relative to their tile
+    assert not package["props"] and len(props["props"]) == 4 and not props["maps"]
+    (about,) = package["maps"]
     assert about["tiles"] == ["./town/town_Tile_0_0.fbx", "./town/town_Tile_1_0.fbx"]
     (name, corners, _, picture), *_ = fbx(tmp_path / "out" / "carla" / "town" / "town_Tile_1_0.fbx")
     assert name.startswith("town_Terrain_tile1") and corners[..., 0].min() == pytest.approx(2990, abs=0.01)
