@@ -69,8 +69,8 @@ def _sensors(scene: Scene, formats: Sequence[str]) -> list[str]:
         return []
     far = max(CAMERA_FAR_M, ceil(scene.far or 0))
     lines = [
-        f"Around the scan there are scenery and a sky for cameras, whose far clipping distance must be {far} m. "
-        "Lidars and depth cameras would measure them as well:\n"
+        "Around the scan there are scenery and a sky for cameras, whose far clipping distance must be at least "
+        f"{far} m. Lidars and depth cameras would measure them as well:\n"
     ]
     if "gazebo" in formats:
         lines.append(
