@@ -20,6 +20,7 @@ from typing import Any, Literal, Protocol
 from pydantic import Field
 
 from scan2sim.pipeline.core.errors import DataError, ScanError, SettingError, SpaceError, from_exception
+from scan2sim.pipeline.core.parameters import is_reserved
 from scan2sim.pipeline.core.plugins import find, module, names
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import Mesh
@@ -141,9 +142,11 @@ def write(
             recorded traffic of Gazebo's world, the README ("readme"). None: their errors are raised.
 
     Raises:
-        ScanError: as `check`, or there is no start pose for the robot; raised before anything is written.
+        ScanError: as `check`, a name is reserved, or there is no start pose for the robot; raised before anything is
+            written.
     """
     check(formats, params, "export.formats", robot)
+    _check_reserved(scene)
     if params.ceiling == "hidden":
         scene = replace(scene, tiles=tuple(map(_without_ceiling, scene.tiles)))
     if not params.backdrop:
@@ -252,6 +255,14 @@ def _without_ceiling(tile: SceneTile) -> SceneTile:
 
 CEILING = "ceiling"
 """Surface that Gazebo's world has as a model of its own."""
+
+
+def _check_reserved(scene: Scene) -> None:
+    """Raise an error if a tile or the world has a name that simulators reserve, as in worlds of earlier versions."""
+    for name in (scene.name, *(tile.name for tile in scene.tiles)):
+        if is_reserved(name):
+            cause = "is reserved by simulators (SDF, MuJoCo), and the name of a tile or the world"
+            raise DataError(name, cause, "Change `name` in the tile.toml or survey.toml, and run it again")
 
 
 def _check_names(scene: Scene) -> None:

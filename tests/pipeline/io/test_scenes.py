@@ -15,7 +15,7 @@ import pytest
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.classes import CODE
-from scan2sim.pipeline.core.errors import InputError, ScanError
+from scan2sim.pipeline.core.errors import DataError, InputError, ScanError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io import world_formats
@@ -273,6 +273,14 @@ def test_no_two_textures_of_gazebos_world_have_the_same_file_name(tmp_path: Path
     written(synthetic.scene(tmp_path), "gazebo", tmp_path / "out")
     names = [path.name for path in (tmp_path / "out").rglob("*.png")]
     assert len(names) == len(set(names)) and len(names) >= 8  # two tiles, two surfaces, two pages
+
+
+def test_worlds_of_reserved_names_are_rejected(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=1)
+    for renamed in (replace(scene, name="world"), replace(scene, tiles=(replace(scene.tiles[0], name="world"),))):
+        with pytest.raises(DataError, match="reserved by simulators"):
+            world_formats.write(renamed, ["glb"], tmp_path / "out", SceneParams(), silent)
+    assert not (tmp_path / "out").exists()
 
 
 def test_carla_knows_the_tags() -> None:
