@@ -31,7 +31,7 @@ USER_EDITABLE_SUFFIXES = (
 )  # fmt: skip
 """Suffixes of files that users edit by hand: copied, never linked."""
 STAMP_FILE, ROADS_STAMP_FILE, DOME_STAMP_FILE = ".result", ".roads", ".dome"
-VERSION = 6
+VERSION = 7
 """Version of the layout: when it changes, worlds are rebuilt."""
 
 
