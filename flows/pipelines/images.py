@@ -13,6 +13,7 @@ from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.step import Params, Step
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io.geodata import crs as crs_io
+from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.steps.import_photos import IMPORT_PHOTOS, ImportPhotosContext, ImportPhotosParams
 from scan2sim.slam.reconstruction import colmap
 from scan2sim.slam.reconstruction.photos import check_count, list_photos, no_photos
@@ -69,6 +70,7 @@ def build_graph(source: Images, here: Path) -> list[Task]:
         names = list_photos(photos)
         if not names:
             raise no_photos(photos)
+        image.check_decoders(photos / name for name in names)
         check_count(photos, names)
     given = {name: getattr(source, name) for name in ("gps", "positions", "times", "cloud")}
     files: dict[str, Path] = {name: here / path for name, path in given.items() if path is not None}

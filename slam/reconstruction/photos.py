@@ -112,11 +112,9 @@ def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:
     """Usable photos of a folder, and warnings: damaged ones, and those in other formats, are left out.
 
     Raises:
-        InputError: there are no photos, or none can be read. DataError: fewer than `MIN_PHOTOS`. UnavailableError:
-            no photo's decoder is installed.
+        InputError: there are no photos, or none can be read. DataError: fewer than `MIN_PHOTOS`.
     """
     names, photos, warnings = list_photos(folder), list[Photo](), list[str]()
-    missing: UnavailableError | None = None
     if not names:
         raise no_photos(folder)
     if (left := _unread(folder, names)) is not None:
@@ -128,15 +126,12 @@ def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:
             image.check_decodes(path)
             width, height = image.size_of(path)
         except (InputError, UnavailableError) as error:
-            missing = error if isinstance(error, UnavailableError) else missing
             warnings.append(f"{name} is skipped: {error.cause}")
             continue
         equivalent, taken = exif.focal_35mm(path), exif.time_taken(path)
         focal = None if equivalent is None else equivalent / FILM_DIAGONAL_MM * math.hypot(width, height)
         seconds, zoned = taken or (None, True)
         photos.append(Photo(name, width, height, focal, seconds, zoned))
-    if missing is not None and not photos:
-        raise missing
     if not photos:
         raise InputError(folder, f"none of its {len(names)} photos can be read ({warnings[-1]})", "Copy them again")
     check_count(folder, photos)
