@@ -35,7 +35,7 @@ from scan2sim.flows.reports.publish import to_read
 from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.pipeline.core import system_libs
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
-from scan2sim.pipeline.core.errors import ScanError, SettingError, SpaceError, StepError
+from scan2sim.pipeline.core.errors import ScanError, SettingError, SpaceError, StepError, UnavailableError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.remote import Remote, is_remote, local_copy
 from scan2sim.pipeline.core.types import Tile
@@ -263,7 +263,7 @@ def _run_tiles(
             before[task] = store.contents(task.full_name)
         outcome = run(planned, store)
         for error in outcome.failed.values():
-            if isinstance(error, (SpaceError, SettingError)):  # not the fault of a single tile
+            if isinstance(error, (SpaceError, SettingError, UnavailableError)):  # not the fault of a single tile
                 raise error
         side_failed |= outcome.side_failed
         if not (outcome.failed or outcome.side_failed):

@@ -14,7 +14,7 @@ from prefect.states import Completed
 
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import make_survey
-from scan2sim.flows.deployed.tile import artifact_key, prefect_executor, with_warnings
+from scan2sim.flows.deployed.tile import absolute, artifact_key, prefect_executor, with_warnings
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.survey import PAGE, overview, rows
@@ -53,6 +53,7 @@ def survey(
         address: of a Dask scheduler or a Ray cluster; default: start one here.
         bus: where the flow and its workers publish progress (`services.monitoring.events.event_publishers`).
     """
+    source, out = absolute("source", source), absolute("out", out)
     try:
         with published(bus, "survey", source, local=False) as on_bus:
             run = prefect_executor(runner, workers, address, memory, cores, on_bus)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State
+from prefect.runtime import deployment
 from prefect.states import Completed
 
 from scan2sim.flows.commands.run import run_tile
@@ -21,11 +24,13 @@ from scan2sim.flows.engine.memory import parse_memory
 from scan2sim.flows.engine.planning import PlannedTask, check
 from scan2sim.flows.engine.progress import PublishedRun, published
 from scan2sim.flows.engine.ready_queue import Outcome, ignore_event
+from scan2sim.flows.engine.shared_disk import SharedDisk, shared
 from scan2sim.flows.engine.versions import versions
 from scan2sim.flows.engine.workers import workers
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.pipeline.core.cache import Manifest, Store
-from scan2sim.pipeline.core.errors import IncompleteError
+from scan2sim.pipeline.core.errors import IncompleteError, SettingError
+from scan2sim.pipeline.core.remote import is_remote
 
 WITH_WARNINGS = "CompletedWithWarnings"
 """Name of the final state of a flow whose world is finished, but side products failed."""
@@ -64,11 +69,12 @@ def prefect_executor(
         if address is None:
             check(planned)  # remote workers may have packages that are missing here
         missing = any(item.reason is not None for item in planned)
-        with workers(runner if missing else "threads", count, address) as call:
+        elsewhere: AbstractContextManager[SharedDisk | None] = shared(store) if missing and address else nullcontext()
+        with workers(runner if missing else "threads", count, address) as call, elsewhere as disk:
 
             def submit(item: PlannedTask) -> Any:
                 manifest = store.folder(item.task.full_name, item.key) / "manifest.json"
-                work = partial(call, run_on_worker, item, store, gigabytes, cores, version, channel)
+                work = partial(call, run_on_worker, item, store, gigabytes, cores, version, channel, disk)
                 return run_step.submit(item.task.full_name, work, str(manifest))
 
             # on a cluster, each worker has its next step queued
@@ -93,8 +99,22 @@ def _progress() -> Callable[[str, float], None]:
 
 
 def artifact_key(*parts: str) -> str:
-    """Key of an artifact, in the characters that Prefect allows: lower-case letters, digits, dashes."""
-    return "-".join(parts).lower().replace("_", "-")
+    """Key of an artifact, in the characters that Prefect allows: lower-case letters of ASCII, digits, dashes."""
+    return re.sub(r"[^a-z0-9]+", "-", "-".join(parts).lower()).strip("-")
+
+
+def absolute(parameter: str, path: str) -> str:
+    """Absolute path of a flow's parameter, the same for workers that run in another folder; URLs stay as they are.
+
+    Raises:
+        SettingError: a relative path in a run of a deployment, whose worker runs it in a temporary folder.
+    """
+    if is_remote(path) or Path(path).is_absolute():
+        return path
+    if deployment.id is not None:
+        cause = f"`{path}` isn't an absolute path: the worker would look for it in a temporary folder"
+        raise SettingError(parameter, cause, "Give an absolute path, as the worker sees it, or a URL (s3://...)")
+    return str(Path(path).absolute())
 
 
 @flow(name="tile")
@@ -103,6 +123,7 @@ def tile(
     bus: str | None = None,
 ) -> State[str]:  # fmt: skip
     """Build the world of one tile, with a Prefect task per step in threads; the result is the path of the report."""
+    path, out = absolute("path", path), absolute("out", out)
     try:
         with published(bus, "tile", path, local=False) as on_bus:
             run = prefect_executor(memory=memory, cores=cores, bus=on_bus)

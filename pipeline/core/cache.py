@@ -273,10 +273,36 @@ class Store:
             self.remote.remove(f"{task}/{key}/manifest.json")
         shutil.rmtree(self.folder(task, key), ignore_errors=True)
 
-    def source(self, path: Path) -> Path:
-        """A source file, fetched from `sources` if it isn't on this machine."""
-        if self.sources is not None and not path.exists() and path.is_relative_to(self.sources.local):
-            self.sources.pull([path.relative_to(self.sources.local).as_posix()])
+    def revalidate(self, task: str = "", key: str = "") -> None:
+        """Let a network drive show what other machines have written below the root, or as a result.
+
+        NFS caches for up to a minute that a file is absent; opening a folder compares it with the server's.
+        """
+        folder = self.root
+        for name in ("", *task.split("/"), key):
+            folder = folder / name
+            with suppress(OSError):
+                os.scandir(folder).close()
+
+    def source(self, path: Path, expected: str | None = None) -> Path:
+        """A source file, fetched from `sources` if it isn't on this machine, or if its copy here is an older one.
+
+        Args:
+            path: the file, below the local folder of `sources`; others are left as they are.
+            expected: its SHA-256 when the run was planned; None: any.
+
+        Raises:
+            InputError: it has changed in the storage since then.
+        """
+        if self.sources is None or path.is_dir() or not path.is_relative_to(self.sources.local):
+            return path
+        if not path.exists() or (expected is not None and digest(path) != expected):
+            name = path.relative_to(self.sources.local).as_posix()
+            self.sources.pull([name])
+            if expected is not None and digest(path) != expected:
+                raise InputError(
+                    f"{self.sources.url}/{name}", "has changed during the run", "Run again once all files are uploaded"
+                )
         return path
 
     def _manifest(self, task: str, key: str) -> Manifest | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator
 from multiprocessing import forkserver
@@ -97,6 +98,21 @@ def test_remote_source_is_fetched(s3: str, tmp_path: Path) -> None:
     first.push(["cloud.laz"])
     store = Store(tmp_path / "steps", sources=second)
     assert store.source(second.local / "cloud.laz").read_text(encoding="utf-8") == "points"
+
+
+def test_machine_with_an_older_copy_of_a_source_fetches_the_new_one(tmp_path: Path) -> None:
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    remote = Remote("memory://daily", tmp_path / "cache")
+    store, cloud = Store(tmp_path / "steps", sources=remote), remote.local / "cloud.laz"
+    files.pipe_file("/daily/cloud.laz", b"Monday")
+    assert store.source(cloud).read_bytes() == b"Monday"
+    files.pipe_file("/daily/cloud.laz", b"Tuesday")
+    planned = hashlib.sha256(b"Tuesday").hexdigest()
+    assert store.source(cloud, planned).read_bytes() == b"Tuesday"
+    files.pipe_file("/daily/cloud.laz", b"half of Wedn")
+    cloud.unlink()
+    with pytest.raises(InputError, match=r"memory://daily/cloud.laz: has changed during the run"):
+        store.source(cloud, planned)
 
 
 def test_damaged_local_copy_is_fetched_and_damaged_remote_result_rebuilt(s3: str, tmp_path: Path) -> None:

@@ -1,0 +1,119 @@
+"""Workers on other machines: network drives that show results late, machines with another disk at the same path."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from scan2sim.flows.engine.dispatch import VISIBLE_ATTEMPTS, dispatch
+from scan2sim.flows.engine.execution import run_on_worker
+from scan2sim.flows.engine.planning import PlannedTask, plan
+from scan2sim.flows.engine.run_task import run_task
+from scan2sim.flows.engine.shared_disk import SharedDisk, shared
+from scan2sim.flows.engine.versions import versions
+from scan2sim.pipeline.core.cache import Manifest, Store
+from scan2sim.pipeline.core.errors import DamagedError, InputError, UnavailableError
+from tests.flows.toy import chain
+
+
+class LateStore(Store):
+    """A store on a network drive: a result appears only after its folders were compared with the server's `late` times.
+
+    Attributes:
+        late: number of times; results that were seen once stay visible.
+    """
+
+    late = 0
+
+    def find(self, task: str, key: str) -> Manifest | None:
+        """As `Store.find`."""
+        return None if self.late > 0 else super().find(task, key)
+
+    def revalidate(self, task: str = "", key: str = "") -> None:
+        """Count the comparison."""
+        self.late -= 1
+
+
+class Finished:
+    """The future of a task that another machine has run; `late` as of `LateStore`."""
+
+    def __init__(self, item: PlannedTask, store: LateStore, late: int) -> None:
+        elsewhere = Store(store.root)
+        run_task(item, elsewhere, item.inputs(elsewhere))
+        store.late = late
+
+    def add_done_callback(self, fn: Callable[[Any], None]) -> None:
+        """The task has ended."""
+        fn(self)
+
+    def result(self, *, raise_on_failure: bool) -> Any:
+        """The path of its manifest."""
+        return "its manifest's path"
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "source.txt"
+    path.write_text("1", encoding="utf-8")
+    return path
+
+
+def test_results_that_a_network_drive_shows_late_are_waited_for(source: Path, tmp_path: Path) -> None:
+    store, pauses = LateStore(tmp_path / "steps"), list[float]()
+    planned = plan(chain(source, tmp_path / "log"), store)
+    outcome = dispatch(planned, store, lambda item: Finished(item, store, 40), 1, lambda *_: None, sleep=pauses.append)
+    assert not outcome.failed and outcome.of_tile()["d"].metrics == {"total": 2}
+    assert len(pauses) == 4 * 40
+
+
+def test_result_on_another_disk_is_explained(source: Path, tmp_path: Path) -> None:
+    store, pauses = LateStore(tmp_path / "steps"), list[float]()
+    planned = plan(chain(source, tmp_path / "log"), store)
+    outcome = dispatch(planned, store, lambda item: Finished(item, store, 999), 1, lambda *_: None, sleep=pauses.append)
+    (error,) = outcome.failed.values()
+    assert isinstance(error, UnavailableError) and "doesn't appear on this machine" in error.cause
+    assert "same path" in error.remedy and len(pauses) == VISIBLE_ATTEMPTS
+
+
+def test_input_that_is_not_visible_yet_is_not_rebuilt(source: Path, tmp_path: Path) -> None:
+    store = LateStore(tmp_path / "steps")
+    first, second = plan(chain(source, tmp_path / "log"), store)[:2]
+    run_task(first, store, first.inputs(store))
+    store.late = 1
+    assert second.inputs(store)["a"].is_file()
+    store.late = 1
+    second.content_key(store)
+    store.late = 2
+    with pytest.raises(DamagedError):
+        second.inputs(store)
+
+
+def test_worker_with_another_disk_writes_nothing(source: Path, tmp_path: Path) -> None:
+    item = plan(chain(source, tmp_path / "log"), Store(tmp_path / "steps"))[0]
+    with shared(Store(tmp_path / "steps")) as disk:
+        disk.check(Store(tmp_path / "steps"))
+        other = Store(tmp_path / "unmounted" / "steps")
+        with pytest.raises(UnavailableError, match=f"steps on {platform.node()}: isn't the folder.*same path"):
+            run_on_worker(item, other, None, None, versions(), None, disk)
+    assert not other.root.exists() and not (tmp_path / "log").exists()
+
+
+def test_mark_of_a_flow_ends_with_it(tmp_path: Path) -> None:
+    store = Store(tmp_path / "steps")
+    store.root.mkdir()
+    (store.root / ".run-killed").touch()
+    with shared(store) as disk:
+        assert [path.name for path in store.root.iterdir()] == [disk.mark]
+    assert not list(store.root.iterdir())
+
+
+def test_errors_name_a_worker_on_another_machine() -> None:
+    error = InputError("cloud.laz", "file not found", "Check the path")
+    SharedDisk(None, platform.node()).name_worker(error)
+    assert error.cause == "file not found"
+    SharedDisk(None, "the flow's machine").name_worker(error)
+    assert error.cause == f"file not found (on {platform.node()})"
