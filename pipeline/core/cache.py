@@ -17,6 +17,7 @@ A manifest holds a digest of itself; one that doesn't match it, or that names fi
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -411,16 +412,37 @@ class Store:
             body = asdict(manifest)
             text = json.dumps(body | {"seal": _seal(body)}, indent=1)
             (folder / "manifest.json").write_text(text, encoding="utf-8")
-            target = self.folder(manifest.label, key)
-            if target.is_symlink():
-                target.unlink()
-            elif target.exists():
-                shutil.rmtree(target)
-            folder.replace(target)
+            if not self._has_same(manifest, key):
+                self._move(folder, self.folder(manifest.label, key))
         except OSError as error:
             raise from_os_error(error, self.root) from None
         if self.remote is not None:  # the manifest last: it makes the result valid
             self.remote.push(f"{manifest.label}/{key}/{name}" for name in (*manifest.sizes, "manifest.json"))
+
+    def _has_same(self, manifest: Manifest, key: str) -> bool:
+        """Whether an intact result with the same files is in place: of a worker that had lost its network, say.
+
+        Readers on other machines may have its files open, so it stays.
+        """
+        folder = self.folder(manifest.label, key)
+        if self.remote is not None or manifest.failed or folder.is_symlink():
+            return False
+        found = self.find(manifest.label, key)
+        return not (found is None or found.failed or found.content != manifest.content or damaged(folder, found))
+
+    def _move(self, folder: Path, target: Path) -> None:
+        """Move a finished folder into place; an older one there, also one that appears meanwhile, is removed."""
+        while True:
+            try:
+                folder.replace(target)
+                return
+            except OSError as error:
+                if error.errno not in (errno.EEXIST, errno.ENOTEMPTY) and not os.path.lexists(target):
+                    raise
+            aside = new_folder(target.parent, TEMPORARY_PREFIX)
+            with suppress(FileNotFoundError):
+                target.replace(aside / "replaced")
+            shutil.rmtree(aside, ignore_errors=True)  # NFS keeps open files; `sweep` removes what is left
 
     def sweep(self, used: Mapping[str, str]) -> None:
         """Remove all results that `used` (task to key) does not name, and what killed runs left behind."""

@@ -92,6 +92,39 @@ def test_input_that_is_not_visible_yet_is_not_rebuilt(source: Path, tmp_path: Pa
         second.inputs(store)
 
 
+def test_second_worker_that_finishes_a_step_leaves_the_result_to_its_readers(source: Path, tmp_path: Path) -> None:
+    """A worker without network for minutes is replaced, but ends its step nevertheless."""
+    store = Store(tmp_path / "steps")
+    item = plan(chain(source, tmp_path / "log"), store)[0]
+    run_task(item, store, item.inputs(store))
+    number = store.folder("a", item.key) / "number.txt"
+    inode = number.stat().st_ino
+    run_task(item, store, item.inputs(store))
+    assert number.stat().st_ino == inode
+    number.write_text("7", encoding="utf-8")
+    run_task(item, store, item.inputs(store))
+    assert number.read_text(encoding="utf-8") == "1", "a damaged result is replaced"
+    assert [path.name for path in (tmp_path / "steps" / "a").iterdir()] == [item.key]
+
+
+def test_result_that_appears_while_it_is_moved_into_place(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path / "steps")
+    item = plan(chain(source, tmp_path / "log"), store)[0]
+    target = store.folder("a", item.key)
+
+    def not_yet(*_: object) -> bool:
+        target.mkdir()
+        (target / "half").touch()
+        return False
+
+    monkeypatch.setattr(store, "_has_same", not_yet)
+    manifest = run_task(item, store, item.inputs(store))
+    found = store.find("a", item.key)
+    assert found is not None and found.content == manifest.content and not (target / "half").exists()
+
+
 def test_worker_with_another_disk_writes_nothing(source: Path, tmp_path: Path) -> None:
     item = plan(chain(source, tmp_path / "log"), Store(tmp_path / "steps"))[0]
     with shared(Store(tmp_path / "steps")) as disk:
