@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import platform
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -68,6 +69,25 @@ def test_results_of_a_drive_are_named_where_they_cant_be_linked(tmp_path: Path, 
     (tmp_path / "steps" / "corridor").mkdir(parents=True)
     _link(tmp_path / "steps" / "corridor", tmp_path / "corridor")
     assert (tmp_path / "corridor.txt").read_text(encoding="utf-8") == "steps/corridor\n"
+
+
+def test_busy_folder_names_the_run_that_uses_it(tmp_path: Path) -> None:
+    with locked(tmp_path), pytest.raises(BusyError) as caught, locked(tmp_path):
+        pass
+    assert f"({platform.node()}, process {os.getpid()}, since 20" in caught.value.cause
+    assert "delete" not in caught.value.remedy
+
+
+def test_lock_of_a_lost_machine_can_be_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NFS keeps the locks of a machine until it starts again, which one of a cloud never does."""
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(platform, "node", lambda: "spot-7")
+        holder = locked(tmp_path)
+        holder.__enter__()
+    with pytest.raises(BusyError) as caught, locked(tmp_path):
+        pass
+    assert "(spot-7, process" in caught.value.cause and f"delete {tmp_path / '.lock'}" in caught.value.remedy
+    holder.__exit__(None, None, None)
 
 
 @pytest.mark.parametrize(
