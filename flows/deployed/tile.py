@@ -70,7 +70,8 @@ def prefect_executor(
             check(planned)  # remote workers may have packages that are missing here
         missing = any(item.reason is not None for item in planned)
         elsewhere: AbstractContextManager[SharedDisk | None] = shared(store) if missing and address else nullcontext()
-        with workers(runner if missing else "threads", count, address) as call, elsewhere as disk:
+        kind, warning = runner if missing else "threads", get_run_logger().warning
+        with workers(kind, count, address, warning) as call, elsewhere as disk:
 
             def submit(item: PlannedTask) -> Any:
                 manifest = store.folder(item.task.full_name, item.key) / "manifest.json"

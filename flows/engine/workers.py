@@ -19,22 +19,30 @@ from scan2sim.pipeline.core.optional_deps import require
 
 Call = Callable[..., Any]
 """Calls a function on a worker, waits, and returns its result or raises its exception."""
+NO_WORKERS = "the {what} at {address} has no workers: steps wait until one connects (`{command}`)"
 
 
-def workers(name: str, count: int, address: str | None = None) -> AbstractContextManager[Call]:
+def ignore_warning(text: str) -> None:
+    """A callback for warnings that does nothing."""
+
+
+def workers(
+    name: str, count: int, address: str | None = None, warn: Callable[[str], None] = ignore_warning
+) -> AbstractContextManager[Call]:  # fmt: skip
     """Workers that run one function at a time each; if a worker dies, another one repeats its function.
 
     Args:
         name: "threads", "dask" or "ray".
         count: number of workers to start here.
         address: of a Dask scheduler or a Ray cluster whose workers to use instead.
+        warn: receives a warning if there are no workers at the address, for which every step waits.
 
     Raises:
         UnavailableError: when the context is entered, nothing answers at the address.
         ScanError: as `check`.
     """
     check(name)
-    return {"threads": _threads, "dask": _dask, "ray": _ray}[name](count, address)
+    return {"threads": _threads, "dask": _dask, "ray": _ray}[name](count, address, warn)
 
 
 def check(name: str) -> None:
@@ -51,12 +59,12 @@ def check(name: str) -> None:
 
 
 @contextmanager
-def _threads(count: int, address: str | None) -> Iterator[Call]:
+def _threads(count: int, address: str | None, warn: Callable[[str], None]) -> Iterator[Call]:
     yield lambda function, *arguments: function(*arguments)
 
 
 @contextmanager
-def _dask(count: int, address: str | None) -> Iterator[Call]:
+def _dask(count: int, address: str | None, warn: Callable[[str], None]) -> Iterator[Call]:
     import dask
     from distributed import Client
 
@@ -70,11 +78,13 @@ def _dask(count: int, address: str | None) -> Iterator[Call]:
     except OSError as error:
         raise _unreachable(address, "Dask scheduler", error) from error
     with client:
+        if address and not client.scheduler_info()["workers"]:
+            warn(NO_WORKERS.format(what="Dask scheduler", address=address, command=f"dask worker {address}"))
         yield lambda function, *arguments: client.submit(function, *arguments, pure=False).result()
 
 
 @contextmanager
-def _ray(count: int, address: str | None) -> Iterator[Call]:
+def _ray(count: int, address: str | None, warn: Callable[[str], None]) -> Iterator[Call]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no telemetry
     import ray
 
@@ -94,6 +104,9 @@ def _ray(count: int, address: str | None) -> Iterator[Call]:
             raise error.cause from None
 
     try:
+        if address and not ray.cluster_resources().get("CPU"):
+            command = f"ray start --address {address}"
+            warn(NO_WORKERS.format(what="Ray cluster", address=address, command=command))
         yield call
     finally:
         ray.shutdown()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scan2sim.pipeline.core.errors import InputError, UnavailableError
+from scan2sim.pipeline.core.errors import InputError, ScanError, UnavailableError, from_os_error
 from scan2sim.pipeline.core.paths import inside
 from scan2sim.pipeline.core.step import Report, silent
 
@@ -67,13 +68,17 @@ class Remote:
 
         Raises:
             InputError: a name points outside of the folder.
+            SpaceError: the disk of the local copy is full, or can't be written.
             UnavailableError: the storage can't be reached or read.
         """
         files, root = self._open()
         for name in names:
             target = self._path(name)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(prefix=".fetch-", dir=target.parent)
+            try:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                handle, temporary = tempfile.mkstemp(prefix=".fetch-", dir=target.parent)
+            except OSError as error:
+                raise from_os_error(error, target) from None
             os.close(handle)
             try:
                 files.get_file(f"{root}/{name}", temporary)
@@ -177,6 +182,9 @@ class Remote:
             raise UnavailableError(self.url, str(error), remedy) from None
         return files, root.rstrip("/")
 
-    def _unreachable(self, error: Exception) -> UnavailableError:
+    def _unreachable(self, error: Exception) -> ScanError:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return from_os_error(error, self.local)  # this machine's disk
         cause = f"can't be reached ({type(error).__name__}: {error})"
-        return UnavailableError(self.url, cause, "Check the address, the credentials and the network")
+        remedy = "Check the address, the credentials (they must permit listing the folder, too) and the network"
+        return UnavailableError(self.url, cause, remedy)

@@ -15,6 +15,7 @@ from scan2sim.flows.engine.planning import PlannedTask, plan
 from scan2sim.flows.engine.run_task import run_task
 from scan2sim.flows.engine.shared_disk import SharedDisk, shared
 from scan2sim.flows.engine.versions import versions
+from scan2sim.flows.engine.workers import workers
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import DamagedError, InputError, UnavailableError
 from tests.flows.toy import chain
@@ -142,6 +143,17 @@ def test_mark_of_a_flow_ends_with_it(tmp_path: Path) -> None:
     with shared(store) as disk:
         assert [path.name for path in store.root.iterdir()] == [disk.mark]
     assert not list(store.root.iterdir())
+
+
+def test_cluster_without_workers_is_named() -> None:
+    """Dask waits for them without a message."""
+    distributed = pytest.importorskip("distributed", reason="Dask isn't installed")
+    said = list[str]()
+    options = {"n_workers": 0, "processes": False, "dashboard_address": None, "host": "127.0.0.1", "protocol": "tcp"}
+    with distributed.LocalCluster(**options) as cluster, workers("dask", 1, cluster.scheduler_address, said.append):
+        pass
+    (text,) = said
+    assert f"{cluster.scheduler_address} has no workers" in text and "`dask worker tcp://" in text
 
 
 def test_errors_name_a_worker_on_another_machine() -> None:

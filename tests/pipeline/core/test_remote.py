@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ import pytest
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import plan
 from scan2sim.pipeline.core.cache import Store
-from scan2sim.pipeline.core.errors import InputError, UnavailableError
+from scan2sim.pipeline.core.errors import InputError, SpaceError, UnavailableError
 from scan2sim.pipeline.core.remote import CACHE_VARIABLE, Remote, is_remote, local_copy
 from tests.flows.toy import chain
 
@@ -150,6 +151,25 @@ def test_key_with_path_traversal_is_rejected(tmp_path: Path, monkeypatch: pytest
         with pytest.raises(InputError, match="points outside of its folder"):
             here.pull([key])
     assert not list(tmp_path.rglob("escaped.txt")) and not Path("/etc/escaped.txt").exists()
+
+
+def test_full_disk_of_the_local_copy_is_not_taken_for_the_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    here = Remote("memory://full", tmp_path / "cache")
+    files.pipe_file("/full/cloud.laz", b"points")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as disk:
+        disk.setattr(type(files), "get_file", full)
+        with pytest.raises(SpaceError, match=f"{tmp_path / 'cache'}: no space left"):
+            here.pull(["cloud.laz"])
+    monkeypatch.setattr(Path, "mkdir", full)
+    with pytest.raises(SpaceError, match="no space left"):
+        here.pull(["new/cloud.laz"])
 
 
 def test_missing_or_unreadable_remote_files_are_reported(s3: str, tmp_path: Path) -> None:
