@@ -20,6 +20,7 @@ from prefect.states import Completed
 from scan2sim.flows.commands.run import run_tile
 from scan2sim.flows.engine.dispatch import dispatch
 from scan2sim.flows.engine.execution import Executor, run_on_worker
+from scan2sim.flows.engine.lock import warning_of_local_locks
 from scan2sim.flows.engine.memory import parse_memory
 from scan2sim.flows.engine.planning import PlannedTask, check
 from scan2sim.flows.engine.progress import PublishedRun, published
@@ -69,6 +70,8 @@ def prefect_executor(
         if address is None:
             check(planned)  # remote workers may have packages that are missing here
         missing = any(item.reason is not None for item in planned)
+        if missing and (text := warning_of_local_locks(store.root)) is not None:
+            get_run_logger().warning(text)
         elsewhere: AbstractContextManager[SharedDisk | None] = shared(store) if missing and address else nullcontext()
         kind, warning = runner if missing else "threads", get_run_logger().warning
         with workers(kind, count, address, warning) as call, elsewhere as disk:

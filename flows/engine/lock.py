@@ -13,6 +13,7 @@ from io import FileIO
 from pathlib import Path
 
 from scan2sim.pipeline.core.errors import BusyError, UnavailableError, from_os_error
+from scan2sim.pipeline.core.mounts import MOUNTED, mount_of
 
 LOCKED = (errno.EWOULDBLOCK, errno.EACCES)
 """Errors of a lock that another process holds; the second one of network drives."""
@@ -46,6 +47,21 @@ def locked(folder: Path) -> Iterator[None]:
             file.truncate(0)
             file.write(f"{platform.node()}, process {os.getpid()}, since {time.strftime('%F %T %Z')}".encode())
         yield
+
+
+def warning_of_local_locks(folder: Path, mounted: Path = MOUNTED) -> str | None:
+    """Warning if locks of a network drive don't keep runs on other machines away; None if they do."""
+    mount = mount_of(folder, mounted)
+    if mount is None or not mount.is_network:
+        return None
+    options = mount.options
+    if not {"nolock", "localflock"} & options.keys() and options.get("local_lock", "none") not in ("all", "flock"):
+        return None
+    return (
+        f"{folder}: locks on this {mount.kind} drive hold for one machine only: two runs on two machines would damage "
+        "each other's results. Start one at a time, or mount it with locks (NFS: without nolock and local_lock; "
+        "Lustre: flock, not localflock)"
+    )
 
 
 def _busy(folder: Path, file: FileIO) -> BusyError:

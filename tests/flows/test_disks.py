@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from scan2sim.flows.commands.drive import _link
-from scan2sim.flows.engine.lock import locked
+from scan2sim.flows.engine.lock import locked, warning_of_local_locks
 from scan2sim.pipeline.core.errors import BusyError, UnavailableError
 from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.worlds.merge import link
@@ -69,6 +69,23 @@ def test_results_of_a_drive_are_named_where_they_cant_be_linked(tmp_path: Path, 
     (tmp_path / "steps" / "corridor").mkdir(parents=True)
     _link(tmp_path / "steps" / "corridor", tmp_path / "corridor")
     assert (tmp_path / "corridor.txt").read_text(encoding="utf-8") == "steps/corridor\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "warned"),
+    [
+        ("nfs rw,vers=3,nolock,local_lock=all", True),
+        ("nfs4 rw,vers=4.2,local_lock=none", False),
+        ("lustre rw,localflock", True),
+        ("lustre rw,flock", False),
+        ("ext4 rw", False),
+    ],
+)
+def test_drives_whose_locks_hold_for_one_machine_only(options: str, warned: bool, tmp_path: Path) -> None:
+    kind, _, options = options.partition(" ")
+    (tmp_path / "mountinfo").write_text(f"22 1 0:1 / / rw - {kind} server:/ {options}\n", encoding="utf-8")
+    text = warning_of_local_locks(Path("/data/town"), tmp_path / "mountinfo") or ""
+    assert ("two runs on two machines" in text and "/data/town" in text) == warned
 
 
 def test_busy_folder_names_the_run_that_uses_it(tmp_path: Path) -> None:
