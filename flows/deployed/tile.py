@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -90,16 +90,32 @@ def prefect_executor(
 
 
 def _progress() -> Callable[[str, float], None]:
-    """Callback that shows the progress of a tile as an artifact of the flow run."""
+    """Callback that shows the progress of a tile as an artifact of the flow run, until the server refuses one."""
     known: dict[str, Any] = {}
+    refused = False
 
     def show(name: str, percent: float) -> None:
-        if name in known:
-            update_progress_artifact(known[name], percent)
-        else:
-            known[name] = create_progress_artifact(percent, key=artifact_key("progress", name), description=name)
+        nonlocal refused
+        if refused:  # each further attempt may take a minute, in which no step is submitted
+            return
+        refused = True
+        with optional_artifact():
+            if name in known:
+                update_progress_artifact(known[name], percent)
+            else:
+                known[name] = create_progress_artifact(percent, key=artifact_key("progress", name), description=name)
+            refused = False
 
     return show
+
+
+@contextmanager
+def optional_artifact() -> Iterator[None]:
+    """Continue with a warning without an artifact that the server refuses: its size, a rate limit, an outage."""
+    try:
+        yield
+    except Exception as error:  # artifacts are for people: a run of hours doesn't fail because of one
+        get_run_logger().warning(f"Prefect's server refused an artifact ({type(error).__name__}: {error})")
 
 
 def artifact_key(*parts: str) -> str:

@@ -78,13 +78,22 @@ def dispatch(
             if isinstance(outcome, DamagedError):
                 queue.rebuild_damaged(item, outcome)
                 continue
-            manifest = None if isinstance(outcome, BaseException) else _visible(item, store, sleep)
+            manifest = _result(item, store, outcome, sleep)
             if manifest is not None:
                 queue.end(item, manifest)
             else:
                 queue.fail(item, _error(item, store, outcome))
     tile_progress.flush()
     return queue.outcome
+
+
+def _result(item: PlannedTask, store: Store, outcome: object, sleep: Callable[[float], None]) -> Manifest | None:
+    """The result of a task whose future has ended; None if there is none."""
+    if not isinstance(outcome, BaseException):
+        return _visible(item, store, sleep)
+    # a worker that had lost its network, and its step to another one, may have finished it
+    found = None if item.ignores_cache else store.find(item.task.full_name, item.key)
+    return None if found is None or found.failed else found
 
 
 def _visible(item: PlannedTask, store: Store, sleep: Callable[[float], None]) -> Manifest | None:

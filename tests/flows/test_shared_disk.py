@@ -71,6 +71,25 @@ def test_results_that_a_network_drive_shows_late_are_waited_for(source: Path, tm
     assert len(pauses) == 4 * 40
 
 
+class Lost(Finished):
+    """The future of a task whose worker is given up, but finishes it nevertheless."""
+
+    def result(self, *, raise_on_failure: bool) -> Any:
+        """The error of the runner."""
+        return RuntimeError("the worker doesn't answer")
+
+
+def test_result_of_a_worker_that_was_given_up_is_used(source: Path, tmp_path: Path) -> None:
+    store = LateStore(tmp_path / "steps")
+    planned = plan(chain(source, tmp_path / "log"), store)
+    outcome = dispatch(planned, store, lambda item: Lost(item, store, 0), 1, lambda *_: None)
+    assert not outcome.failed and set(outcome.of_tile()) == set("abcd")
+    planned = plan(chain(source, tmp_path / "log"), store, force=True)
+    outcome = dispatch(planned, store, lambda item: Lost(item, store, 0), 1, lambda *_: None)
+    (error,) = outcome.failed.values()
+    assert "the worker doesn't answer" in error.cause, "a forced step isn't taken for done by its earlier result"
+
+
 def test_result_on_another_disk_is_explained(source: Path, tmp_path: Path) -> None:
     store, pauses = LateStore(tmp_path / "steps"), list[float]()
     planned = plan(chain(source, tmp_path / "log"), store)
@@ -124,6 +143,24 @@ def test_result_that_appears_while_it_is_moved_into_place(
     manifest = run_task(item, store, item.inputs(store))
     found = store.find("a", item.key)
     assert found is not None and found.content == manifest.content and not (target / "half").exists()
+
+
+def test_machine_that_finds_everything_damaged_does_not_keep_the_others_busy(source: Path, tmp_path: Path) -> None:
+    class Broken(Finished):
+        def __init__(self, item: PlannedTask, store: LateStore) -> None:
+            super().__init__(item, store, 0)
+            self._name = item.task.id.name
+
+        def result(self, *, raise_on_failure: bool) -> Any:
+            return DamagedError("a") if self._name == "b" else super().result(raise_on_failure=raise_on_failure)
+
+    store = LateStore(tmp_path / "steps")
+    planned = plan(chain(source, tmp_path / "log"), store)
+    outcome = dispatch(planned, store, lambda item: Broken(item, store), 1, lambda *_: None)
+    (error,) = outcome.failed.values()
+    assert error.where == "b" and "a, which it reads, is damaged after each of 3 rebuilds" in error.cause
+    assert set(outcome.of_tile()) == {"a", "c"}
+    assert (tmp_path / "log").read_text(encoding="utf-8").split().count("a") == 4
 
 
 def test_worker_with_another_disk_writes_nothing(source: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,6 +30,23 @@ def test_relative_path_of_a_deployment_is_rejected(path: str, monkeypatch: pytes
     with pytest.raises(SettingError, match=re.escape(f"out: `{path}` isn't an absolute path")):
         tile.absolute("out", path)
     assert tile.absolute("out", "/data/town") == "/data/town"
+
+
+def test_refused_artifact_does_not_fail_the_run(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    asked = list[str]()
+
+    def refuse(*_: object, key: str, **__: object) -> None:
+        asked.append(key)
+        raise RuntimeError("429 Too Many Requests")
+
+    monkeypatch.setattr(tile, "create_progress_artifact", refuse)
+    monkeypatch.setattr(tile, "get_run_logger", lambda: logging.getLogger("run"))
+    show = tile._progress()
+    for percent in (10.0, 20.0):
+        show("street_0001", percent)
+    assert asked == ["progress-street-0001"] and "429 Too Many Requests" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["Town 2026.11", "Straße_7", "tile.0001", "(copy)"])
