@@ -12,7 +12,7 @@ from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.engine.ready_queue import Event, EventCallback, Outcome, ReadyQueue, ignore_event
 from scan2sim.flows.pipelines.graph import Task, TaskId
 from scan2sim.pipeline.core.cache import Manifest, Store
-from scan2sim.pipeline.core.errors import DamagedError, ScanError, StepError, UnavailableError
+from scan2sim.pipeline.core.errors import DamagedError, ScanError, StepError, WorkerError
 
 PROGRESS_INTERVAL_S = 1.0  # seconds between updates of `show`, which may take a tenth of a second
 VISIBLE_INTERVAL_S, VISIBLE_ATTEMPTS = 1.0, 60
@@ -116,10 +116,11 @@ def _error(item: PlannedTask, store: Store, outcome: object) -> ScanError:
     if isinstance(outcome, BaseException):
         cause = f"its worker failed ({type(outcome).__name__}: {outcome})"
         return StepError(name, cause, "Run again: finished steps are not repeated; the worker's log has the details")
-    return UnavailableError(
+    return WorkerError(
         store.folder(name, item.key),
         "a worker reports this result, but it doesn't appear on this machine",
-        "Mount the disk of --out at the same path on all machines, or use object storage for --out",
+        "Mount the disk of --out at the same path on all machines, let workers run as the same user, or use object "
+        "storage for --out",
     )
 
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from scan2sim.pipeline.core.cache import Store
-from scan2sim.pipeline.core.errors import ScanError, UnavailableError, from_os_error
+from scan2sim.pipeline.core.errors import ScanError, WorkerError, from_os_error
 
 MARK_PREFIX = ".run-"
 """First characters of the name of a file that a flow leaves beside the cached results while its workers run."""
@@ -31,7 +31,7 @@ class SharedDisk:
         """Check that this machine sees the folder that the flow writes to.
 
         Raises:
-            UnavailableError: it has another folder there, or none; no step may write there.
+            WorkerError: it has another folder there, or none; no step may write there.
         """
         if self.mark is None:
             return
@@ -39,7 +39,7 @@ class SharedDisk:
             store.revalidate()
             (store.root / self.mark).stat()
         except OSError as error:
-            raise UnavailableError(
+            raise WorkerError(
                 f"{store.root} on {platform.node()}",
                 f"isn't the folder that the flow on {self.host} writes to ({error.strerror})",
                 "Mount the disk of --out at the same path on all machines, or use object storage for --out",
