@@ -19,7 +19,7 @@ from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.pipeline.core import system_libs
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.cores import THREAD_VARIABLES
-from scan2sim.pipeline.core.errors import DamagedError, ScanError, UnavailableError
+from scan2sim.pipeline.core.errors import DamagedError, ScanError, WorkerError
 
 Executor = Callable[[list[PlannedTask], Store], Outcome]
 """Runs the tasks of a plan that have no cached results."""
@@ -169,7 +169,8 @@ def run_on_worker(
         disk: the flow's disk, for a worker that may be on another machine.
 
     Raises:
-        UnavailableError: this worker has other versions or doesn't see the flow's disk, or libraries are missing.
+        WorkerError: this worker has other versions, or doesn't see the flow's disk.
+        UnavailableError: system libraries are missing.
         ScanError: as `run_task`; names the machine if it isn't the flow's.
     """
     try:
@@ -182,6 +183,6 @@ def run_on_worker(
         with reserve_memory(memory, expected_memory(item, store)), published_step(channel, item, store) as on_event:
             return run_in_subprocess(item, store, on_event)
     except ScanError as error:
-        if disk is not None and not isinstance(error, UnavailableError):  # these name the machine
+        if disk is not None and not isinstance(error, WorkerError):  # these name the machine
             disk.name_worker(error)
         raise
