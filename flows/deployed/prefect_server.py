@@ -63,21 +63,33 @@ def _check(url: str, client: SyncPrefectClient) -> None:
     """
     problem = client.api_healthcheck()
     if problem is not None:
-        raise UnavailableError(url, f"the Prefect server doesn't answer ({problem})", REMEDY_SERVER)
+        raise _refused(url, problem) or UnavailableError(
+            url, f"the Prefect server doesn't answer ({problem})", REMEDY_SERVER
+        )
     if client.server_type == ServerType.CLOUD:
         return
     try:
         version = client.api_version()
     except PrefectHTTPStatusError as error:
-        if error.response.status_code not in (401, 403):
-            raise UnavailableError(url, f"isn't the API of a Prefect server ({error})", REMEDY_SERVER) from None
-        remedy = "Set PREFECT_API_AUTH_STRING to the server's PREFECT_SERVER_API_AUTH_STRING (user:password)"
-        raise UnavailableError(url, "the Prefect server refuses the credentials", remedy) from None
+        raise _refused(url, error) or UnavailableError(
+            url, f"isn't the API of a Prefect server ({error})", REMEDY_SERVER
+        ) from None
     except ValueError:  # not JSON: the page for browsers
         raise UnavailableError(url, "isn't the API of a Prefect server", REMEDY_SERVER) from None
     if version.split(".")[0] != own_version.split(".")[0]:
         cause = f"the Prefect server has version {version}, but this machine {own_version}"
         raise UnavailableError(url, cause, "Install the same version on both (constraints.txt)")
+
+
+def _refused(url: str, error: Exception) -> UnavailableError | None:
+    """The error for the user if a server answered that it doesn't accept the credentials."""
+    if not isinstance(error, PrefectHTTPStatusError) or error.response.status_code not in (401, 403):
+        return None
+    remedy = (
+        "Set PREFECT_API_AUTH_STRING to the server's PREFECT_SERVER_API_AUTH_STRING (user:password); "
+        "for Prefect Cloud, run `prefect cloud login`"
+    )
+    return UnavailableError(url, "the Prefect server refuses the credentials", remedy)
 
 
 @contextlib.contextmanager

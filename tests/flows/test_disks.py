@@ -6,6 +6,7 @@ import errno
 import fcntl
 import os
 import platform
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from scan2sim.flows.commands.drive import _link
 from scan2sim.flows.engine.lock import locked, warning_of_local_locks
 from scan2sim.pipeline.core.errors import BusyError, UnavailableError
 from scan2sim.pipeline.io.file_checks import copy_tree
-from scan2sim.pipeline.io.worlds.merge import link
+from scan2sim.pipeline.io.worlds.merge import link, swap
 from tests.flows.inline_steps import inline_steps
 from tests.flows.tiny import COARSE, tiny
 from tests.flows.tiny import scan2sim as run_scan2sim
@@ -63,6 +64,23 @@ def test_folders_are_copied_to_a_disk_that_refuses_times(
     for _ in range(2):  # the second time into the folder of the first one
         copy_tree(tmp_path / "made", tmp_path / "world", link)
     assert (tmp_path / "world" / "meshes" / "ground.glb").read_bytes() == b"mesh"
+
+
+def test_world_is_replaced_although_a_simulator_has_the_earlier_ones_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """NFS keeps the name of an open file, and so its folder."""
+    for name in ("first", "second", "third"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "ground.glb").write_text(name, encoding="utf-8")
+    with monkeypatch.context() as nfs:
+        nfs.setattr(shutil, "rmtree", lambda *_, **__: None)
+        for name in ("first", "second", "third"):
+            swap(tmp_path / name, tmp_path / "world")
+            assert (tmp_path / "world" / "ground.glb").read_text(encoding="utf-8") == name
+    (tmp_path / "fourth").mkdir()
+    swap(tmp_path / "fourth", tmp_path / "world")
+    assert [path.name for path in tmp_path.iterdir()] == ["world"], "closed files are deleted by the next run"
 
 
 def test_results_of_a_drive_are_named_where_they_cant_be_linked(tmp_path: Path, exfat: None) -> None:
