@@ -29,7 +29,8 @@ def test_automations_leave_other_flows_of_the_server_alone() -> None:
         assert {names} <= ours if isinstance(names, str) else set(names) <= ours
     silent = next(one["trigger"] for one in AUTOMATIONS if one["trigger"]["posture"] == "Proactive")
     assert set(silent["match_related"]["prefect.resource.name"]) == ours
-    assert {"prefect.flow-run.Completed", "prefect.flow-run.CompletedWithWarnings"} <= set(silent["expect"])
+    quiet = {"Completed", "CompletedWithWarnings", "Skipped", "Failed", "Cancelled", "Crashed", "AwaitingRetry"}
+    assert {f"prefect.flow-run.{name}" for name in quiet} <= set(silent["expect"])
 
 
 def test_memory_of_steps_is_less_than_that_of_their_container() -> None:
