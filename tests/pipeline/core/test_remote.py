@@ -13,6 +13,7 @@ import pytest
 
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import plan
+from scan2sim.pipeline.core import remote
 from scan2sim.pipeline.core.cache import Store
 from scan2sim.pipeline.core.errors import InputError, SpaceError, UnavailableError
 from scan2sim.pipeline.core.remote import CACHE_VARIABLE, Remote, is_remote, local_copy
@@ -151,6 +152,31 @@ def test_key_with_path_traversal_is_rejected(tmp_path: Path, monkeypatch: pytest
         with pytest.raises(InputError, match="points outside of its folder"):
             here.pull([key])
     assert not list(tmp_path.rglob("escaped.txt")) and not Path("/etc/escaped.txt").exists()
+
+
+def test_killed_download_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    here, fetched = Remote("memory://kilometres", tmp_path / "cache"), list[str]()
+    for i in range(4):
+        files.pipe_file(f"/kilometres/{i}.laz", b"points")
+    get = type(files).get_file
+
+    def killed_at_the_third(self: object, source: str, *arguments: object, **options: object) -> None:
+        if len(fetched) == 2:
+            raise KeyboardInterrupt
+        fetched.append(source)
+        get(self, source, *arguments, **options)
+
+    monkeypatch.setattr(remote, "INDEX_INTERVAL_S", -1.0)
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(type(files), "get_file", killed_at_the_third)
+        here.pull_all()
+    fetched *= 2  # no more kills
+    monkeypatch.setattr(type(files), "get_file", killed_at_the_third)
+    here.pull_all()
+    assert [source.rpartition("/")[2] for source in fetched[4:]] == ["2.laz", "3.laz"]
+    (here.local / ".remote.json").write_text('{"0.la', encoding="utf-8")
+    assert (here.pull_all() / "3.laz").read_bytes() == b"points", "a damaged index is made again"
 
 
 def test_full_disk_of_the_local_copy_is_not_taken_for_the_network(
