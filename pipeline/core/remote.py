@@ -105,7 +105,9 @@ class Remote:
         index = self.local / PULLED_INDEX
         try:
             files.invalidate_cache()
-            found = {path[len(root) + 1 :]: str(files.ukey(path)) for path in files.find(root)}
+            # consoles and other programs mark folders by empty objects whose keys end with a slash
+            paths = [path for path in files.find(root) if len(path) > len(root) and not path.endswith("/")]
+            found = {path[len(root) + 1 :]: str(files.ukey(path)) for path in paths}
         except Exception as error:
             raise self._unreachable(error) from error
         if not found:

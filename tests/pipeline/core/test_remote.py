@@ -154,6 +154,19 @@ def test_key_with_path_traversal_is_rejected(tmp_path: Path, monkeypatch: pytest
     assert not list(tmp_path.rglob("escaped.txt")) and not Path("/etc/escaped.txt").exists()
 
 
+def test_objects_that_mark_folders_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As "Create folder" of AWS's console makes them."""
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    here = Remote("memory://marked", tmp_path / "cache")
+    files.pipe_file("/marked/tile/cloud.laz", b"points")
+    keys = ["/marked/", "/marked/tile/", "/marked/tile/cloud.laz"]
+    monkeypatch.setattr(type(files), "find", lambda *_: keys)
+    assert (here.pull_all() / "tile" / "cloud.laz").read_bytes() == b"points"
+    keys.pop()
+    with pytest.raises(InputError, match="is empty"):
+        here.pull_all()
+
+
 def test_killed_download_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = pytest.importorskip("fsspec").filesystem("memory")
     here, fetched = Remote("memory://kilometres", tmp_path / "cache"), list[str]()
