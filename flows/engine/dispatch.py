@@ -62,6 +62,7 @@ def dispatch(
     queue = ReadyQueue(planned, store, track)
     running: dict[TaskId, tuple[PlannedTask, Future]] = {}
     ended: SimpleQueue[TaskId] = SimpleQueue()
+    attempts = VISIBLE_ATTEMPTS
     while queue or running:
         for item in queue.ready():
             if len(running) >= max_submitted:
@@ -78,7 +79,11 @@ def dispatch(
             if isinstance(outcome, DamagedError):
                 queue.rebuild_damaged(item, outcome)
                 continue
-            manifest = _result(item, store, outcome, sleep)
+            if isinstance(outcome, BaseException):
+                manifest = _finished_elsewhere(item, store)
+            else:
+                manifest = _visible(item, store, attempts, sleep)
+                attempts = 1 if manifest is None else attempts  # the next ones won't appear, either
             if manifest is not None:
                 queue.end(item, manifest)
             else:
@@ -87,25 +92,24 @@ def dispatch(
     return queue.outcome
 
 
-def _result(item: PlannedTask, store: Store, outcome: object, sleep: Callable[[float], None]) -> Manifest | None:
-    """The result of a task whose future has ended; None if there is none."""
-    if not isinstance(outcome, BaseException):
-        return _visible(item, store, sleep)
-    # a worker that had lost its network, and its step to another one, may have finished it
+def _finished_elsewhere(item: PlannedTask, store: Store) -> Manifest | None:
+    """The result of a failed task from a worker that had lost its network, and so its step to another one, if any."""
     found = None if item.ignores_cache else store.find(item.task.full_name, item.key)
     return None if found is None or found.failed else found
 
 
-def _visible(item: PlannedTask, store: Store, sleep: Callable[[float], None]) -> Manifest | None:
+def _visible(item: PlannedTask, store: Store, attempts: int, sleep: Callable[[float], None]) -> Manifest | None:
     """The result that a worker has written, once this machine sees it; None if it doesn't appear."""
     name = item.task.full_name
-    for _ in range(VISIBLE_ATTEMPTS):
+    for _ in range(attempts):
         manifest = store.find(name, item.key)
+        if manifest is None:
+            store.revalidate(name, item.key)
+            manifest = store.find(name, item.key)
         if manifest is not None:
             return manifest
-        store.revalidate(name, item.key)
         sleep(VISIBLE_INTERVAL_S)
-    return store.find(name, item.key)
+    return None
 
 
 def _error(item: PlannedTask, store: Store, outcome: object) -> ScanError:
