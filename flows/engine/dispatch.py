@@ -119,7 +119,10 @@ def _error(item: PlannedTask, store: Store, outcome: object) -> ScanError:
         return outcome
     if isinstance(outcome, BaseException):
         cause = f"its worker failed ({type(outcome).__name__}: {outcome})"
-        return StepError(name, cause, "Run again: finished steps are not repeated; the worker's log has the details")
+        remedy = (
+            "After an update, restart all workers. Run again: finished steps aren't repeated; the worker's log has more"
+        )
+        return StepError(name, cause, remedy)
     return WorkerError(
         store.folder(name, item.key),
         "a worker reports this result, but it doesn't appear on this machine",
