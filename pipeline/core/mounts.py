@@ -19,7 +19,7 @@ class Mount:
     """A mounted disk.
 
     Attributes:
-        kind: type of its file system (`ext4`, `nfs4`).
+        kind: type of its file system (`nfs4`).
         options: as the file system reports them (`local_lock`: `none`); those without a value have an empty one.
     """
 
