@@ -73,7 +73,11 @@ def survey(
     hold_out: HoldOut = None,
     jobs: Annotated[
         int,
-        typer.Option(min=0, help="Steps that run at the same time; 0: one for every two cores, as free memory allows."),
+        typer.Option(
+            min=0,
+            help="Steps that run at the same time; 0: one for every two cores, as free memory allows; "
+            "with --address, as many as its workers.",
+        ),
     ] = 0,
     memory: Annotated[
         str | None, typer.Option(help="Memory that all running steps may use together, such as 20GB.")
@@ -96,7 +100,7 @@ def survey(
         require(f"--runner {runner}", "prefect")
         workers.check(runner)
         as_flow: Callable[..., object] = context.obj
-        jobs = jobs or default_jobs()
+        jobs = jobs or (0 if address and runner != "threads" else default_jobs())
         as_flow(source, out, length, buffer, settings.values, runner, jobs, memory, cores, address, bus)
 
 

@@ -51,7 +51,7 @@ def survey(
         length, buffer: tile length and overlap in metres if the source is cut; default: of the drive, or 100 and 5.
         settings: by step, as in a settings file.
         runner: "threads", "dask" or "ray": where steps run (`engine.workers`).
-        workers: number of steps that run at the same time.
+        workers: number of steps that run at the same time; 0, with an address: as many as its workers.
         memory: limit of the memory of all steps on one machine, "20GB".
         cores: CPU cores per step; default: all.
         address: of a Dask scheduler or a Ray cluster; default: start one here.

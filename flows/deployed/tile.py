@@ -56,13 +56,16 @@ def prefect_executor(
 
     Args:
         runner, count, address: kind, number and address of the workers (`engine.workers`); they run only during a plan.
+            With an address, a number of 0 stands for all of them.
         memory: limit of the memory of all steps on one machine, "20GB".
         cores: CPU cores per step.
         bus: publishes the progress.
 
     Raises:
-        ScanError: this kind of workers isn't available.
+        ScanError: this kind of workers isn't available, or there would be none.
     """
+    if count == 0 and (runner == "threads" or address is None):
+        raise SettingError("workers", "0 workers are those of a cluster, but no address is given", "Give a number")
     gigabytes, version, channel = parse_memory(memory), versions(), bus and bus.channel
     workers(runner, count, address)  # raises early if they aren't available
 
@@ -74,15 +77,15 @@ def prefect_executor(
             get_run_logger().warning(text)
         elsewhere: AbstractContextManager[SharedDisk | None] = shared(store) if missing and address else nullcontext()
         kind, warning = runner if missing else "threads", get_run_logger().warning
-        with workers(kind, count, address, warning) as call, elsewhere as disk:
+        with workers(kind, count, address, warning) as there, elsewhere as disk:
 
             def submit(item: PlannedTask) -> Any:
                 manifest = store.folder(item.task.full_name, item.key) / "manifest.json"
-                work = partial(call, run_on_worker, item, store, gigabytes, cores, version, channel, disk)
+                work = partial(there.call, run_on_worker, item, store, gigabytes, cores, version, channel, disk)
                 return run_step.submit(item.task.full_name, work, str(manifest))
 
             # on a cluster, each worker has its next step queued
-            max_submitted = count if runner == "threads" else 2 * count
+            max_submitted = there.count if runner == "threads" else 2 * there.count
             on_event = bus.steps.track(planned, store) if bus else ignore_event
             return dispatch(planned, store, submit, max_submitted, _progress(), on_event)
 

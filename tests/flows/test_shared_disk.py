@@ -16,7 +16,7 @@ from scan2sim.flows.engine.planning import PlannedTask, plan
 from scan2sim.flows.engine.run_task import run_task
 from scan2sim.flows.engine.shared_disk import SharedDisk, shared
 from scan2sim.flows.engine.versions import versions
-from scan2sim.flows.engine.workers import workers
+from scan2sim.flows.engine.workers import STEPS_OF_EMPTY_CLUSTER, workers
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.errors import DamagedError, InputError, UnavailableError
 from tests.flows.toy import chain
@@ -201,10 +201,19 @@ def test_cluster_without_workers_is_named() -> None:
     options = {"n_workers": 0, "processes": False, "dashboard_address": None, "host": "127.0.0.1", "protocol": "tcp"}
     with distributed.LocalCluster(**options) as cluster:
         address = cluster.scheduler_address
-        with workers("dask", 1, address, said.append):
-            pass
+        with workers("dask", 0, address, said.append) as empty:
+            assert empty.count == STEPS_OF_EMPTY_CLUSTER, "a cluster that grows on demand sees a demand"
     (text,) = said
     assert f"{address} has no workers" in text and f"`dask worker {address}`" in text
+
+
+def test_all_workers_of_a_cluster_are_used_by_default() -> None:
+    distributed = pytest.importorskip("distributed", reason="Dask isn't installed")
+    options = {"processes": False, "dashboard_address": None, "host": "127.0.0.1", "protocol": "tcp"}
+    with distributed.LocalCluster(n_workers=3, threads_per_worker=2, **options) as cluster:
+        for given, used in ((0, 6), (4, 4)):
+            with workers("dask", given, cluster.scheduler_address) as there:
+                assert there.count == used and there.call(sum, [1, 2]) == 3
 
 
 def test_errors_name_a_worker_on_another_machine() -> None:
