@@ -46,6 +46,7 @@ def locked(folder: Path) -> Iterator[None]:
         with suppress(OSError):  # a full disk
             file.truncate(0)
             file.write(f"{platform.node()}, process {os.getpid()}, since {time.strftime('%F %T %Z')}".encode())
+            os.fsync(file.fileno())  # other machines read it, which NFS shows only what has reached the server
         yield
 
 
