@@ -56,12 +56,15 @@ def warning_of_local_locks(folder: Path, mounted: Path = MOUNTED) -> str | None:
     if mount is None or not mount.is_network:
         return None
     options = mount.options
-    if not {"nolock", "localflock"} & options.keys() and options.get("local_lock", "none") not in ("all", "flock"):
+    if not {"nolock", "localflock", "nobrl"} & options.keys() and options.get("local_lock", "none") not in (
+        "all",
+        "flock",
+    ):
         return None
     return (
         f"{folder}: locks on this {mount.kind} drive hold for one machine only: two runs on two machines would damage "
         "each other's results. Start one at a time, or mount it with locks (NFS: without nolock and local_lock; "
-        "Lustre: flock, not localflock)"
+        "Lustre: flock, not localflock; CIFS: without nobrl)"
     )
 
 

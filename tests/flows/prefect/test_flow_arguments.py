@@ -32,6 +32,12 @@ def test_relative_path_of_a_deployment_is_rejected(path: str, monkeypatch: pytes
     assert tile.absolute("out", "/data/town") == "/data/town"
 
 
+@pytest.mark.parametrize(("runner", "address"), [("dask", None), ("threads", "tcp://HEAD:8786")])
+def test_no_workers_without_a_cluster(runner: str, address: str | None) -> None:
+    with pytest.raises(SettingError, match="workers: 0 workers are those of a cluster"):
+        tile.prefect_executor(runner, 0, address)
+
+
 def test_refused_artifact_does_not_fail_the_run(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
