@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
 from typing import Any
 
+import pytest
 import yaml
 
 from scan2sim.flows.engine.memory import parse_memory
@@ -31,6 +34,20 @@ def test_automations_leave_other_flows_of_the_server_alone() -> None:
     assert set(silent["match_related"]["prefect.resource.name"]) == ours
     quiet = {"Completed", "CompletedWithWarnings", "Skipped", "Failed", "Cancelled", "Crashed", "AwaitingRetry"}
     assert {f"prefect.flow-run.{name}" for name in quiet} <= set(silent["expect"])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "SCAN2SIM_SOURCE: is not set"),
+        ({"SCAN2SIM_SOURCE": "/data/drive"}, "SCAN2SIM_OUT: is not set"),
+        ({"SCAN2SIM_SOURCE": "s3://bucket/tiles", "SCAN2SIM_OUT": "town"}, "town: is a relative path"),
+    ],
+)
+def test_setup_names_paths_that_nightly_runs_would_not_find(given: dict[str, str], message: str) -> None:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("SCAN2SIM_")}
+    done = subprocess.run(["sh", "deploy/setup"], cwd=ROOT, env=environment | given, capture_output=True, text=True)
+    assert done.returncode != 0 and message in done.stderr, done.stderr
 
 
 def test_memory_of_steps_is_less_than_that_of_their_container() -> None:
