@@ -44,7 +44,7 @@ PAGES = [
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PARAMS: dict[str, type[Params]] = {step.name: step.params for step in STEPS}
 OTHER_PROGRAMS = re.compile(
-    r"\b(prefect|docker|dask|ray|gz|gz_args|pip|aws|curl|kubectl|trtexec|esmini|ros2|export.py)\b"
+    r"\b(prefect|docker|dask|ray|gz|gz_args|pip|aws|curl|kubectl|SBATCH|srun|trtexec|esmini|ros2|export.py)\b"
 )
 """Other programs, whose options a page may mention if it also shows them in a command."""
 IMAGES, ARRAYS, MESHES = {"png", "jpg"}, {"npz", "npy", "laz", "csv"}, {"obj", "mtl", "dae", "glb", "sdf"}
