@@ -124,7 +124,7 @@ def _ray(count: int, address: str | None, warn: Callable[[str], None]) -> Iterat
 
     try:
         if address:
-            there = int(ray.cluster_resources().get("CPU", 0))
+            there = int(ray.cluster_resources().get("CPU", 0))  # type: ignore[no-untyped-call]
             if there == 0:
                 command = f"ray start --address {address}"
                 warn(NO_WORKERS.format(what="Ray cluster", address=address, command=command))
