@@ -29,14 +29,13 @@ def camera_of(info: Any, *, rectified: bool) -> Camera:
 
     Args:
         info: the message; of ROS 1 (fields D, K, P) or ROS 2 (d, k, p).
-        rectified: for a rectified image, whose intrinsics are those of P, without distortion; as well if there is no K.
+        rectified: for a rectified image, whose intrinsics are those of P, without distortion.
 
     Raises:
         InvalidCamera: it isn't calibrated, or its distortion model is unknown.
     """
     K, D, P = (np.asarray(_field(info, name), np.float64) for name in "kdp")
     name = str(info.distortion_model)
-    rectified = rectified or (not K[0] and P[0] > 0)
     width, height = int(info.width), int(info.height)
     fx, fy, cx, cy = (P[0], P[5], P[2], P[6]) if rectified and P[0] > 0 else (K[0], K[4], K[2], K[5])
     if not (width and height and np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0):
@@ -59,6 +58,12 @@ def camera_of(info: Any, *, rectified: bool) -> Camera:
     if wanted is None or not np.isfinite(D).all():
         raise InvalidCamera(f"has {len(D)} coefficients of the model {name!r}")
     return Camera(model, *size, float(fx), float(fy), float(cx), float(cy), tuple(float(d) for d in D[:wanted]))
+
+
+def has_only_projection(info: Any) -> bool:
+    """Whether a `CameraInfo` has P, but no K: that of images which were rectified."""
+    K, P = (np.asarray(_field(info, name), np.float64) for name in "kp")
+    return not K.any() and bool(P[0] > 0)
 
 
 def looks_rectified(info: Any) -> bool:

@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers.bag import contents, images
 from scan2sim.pipeline.importers.bag.camera_topics import CameraTopics, base, rectified
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, looks_rectified
+from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, has_only_projection, looks_rectified
 from scan2sim.pipeline.importers.bag.clocks import check_clocks
 from scan2sim.pipeline.importers.bag.contents import Contents
 from scan2sim.pipeline.importers.bag.lidar_topics import LidarTopics
@@ -297,7 +297,8 @@ class _Planner:
             infos = ", ".join(self.found.topics("info")) or "none"
             raise InputError(self.path, f"has no CameraInfo of {topic} (it has {infos})", remedy)
         try:
-            camera = camera_of(self.found.first[info], rectified=rectified(topic))
+            first = self.found.first[info]
+            camera = camera_of(first, rectified=rectified(topic) or has_only_projection(first))
         except InvalidCamera as error:
             raise InputError(self.path, f"the message of {info} {error}", remedy) from None
         if not rectified(topic) and looks_rectified(self.found.first[info]):

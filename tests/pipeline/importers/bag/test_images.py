@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.camera.models import project
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, looks_rectified
+from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, has_only_projection, looks_rectified
 from scan2sim.pipeline.importers.bag.images import InvalidImage, compressed_file, raw_file
 
 RGB = np.zeros((16, 24, 3), np.uint8)
@@ -136,7 +136,9 @@ def test_rectified_images_have_the_intrinsics_of_p() -> None:
 
 
 def test_camera_without_k_has_that_of_p() -> None:
-    camera = camera_of(info("", [], k=[0.0] * 9), rectified=False)
+    without = info("", [], k=[0.0] * 9)
+    assert has_only_projection(without) and not has_only_projection(info("", []))
+    camera = camera_of(without, rectified=True)
     assert (camera.model, camera.fx, camera.cx, camera.distortion) == ("pinhole", 350, 330, ())
 
 
