@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -62,6 +62,25 @@ class Lens:
 
 
 @dataclass(frozen=True)
+class Panorama:
+    """The camera of equirectangular panorama photos, which has no lens to solve.
+
+    Attributes:
+        width, height: pixels.
+    """
+
+    width: int
+    height: int
+    model: ClassVar[str] = "EQUIRECTANGULAR"
+    fixed: ClassVar[bool] = True
+
+    @property
+    def params(self) -> str:
+        """Parameters of the camera model."""
+        return f"{self.width},{self.height}"
+
+
+@dataclass(frozen=True)
 class Component:
     """Connected part of a reconstruction: `folder` of the model, `names` of its photos, points, error in pixels."""
 
@@ -71,7 +90,7 @@ class Component:
     error: float
 
 
-def add_photos(database: Path, images: Path, names: Sequence[str], lens: Lens) -> int:
+def add_photos(database: Path, images: Path, names: Sequence[str], lens: Lens | Panorama) -> int:
     """Add photos of one camera to the database, in order, if they aren't there; returns the camera's id."""
     import pycolmap
 
@@ -222,7 +241,8 @@ def precise_points(model: Path) -> tuple[F64, F64]:
 
     found = pycolmap.Reconstruction(model)
     centres = {key: image.projection_center() for key, image in found.images.items()}
-    focal = {key: found.cameras[image.camera_id].mean_focal_length() for key, image in found.images.items()}
+    cameras = {key: found.cameras[image.camera_id] for key, image in found.images.items()}
+    focal = {key: one.mean_focal_length() or one.width / (2 * np.pi) for key, one in cameras.items()}  # 0: a panorama
     points, sigma = [], []
     for point in found.points3D.values():
         seen = [element.image_id for element in point.track.elements]

@@ -211,25 +211,18 @@ def extract_frames(
     return photos
 
 
-def check_perspective(source: Path, first: Path, photo: Photo) -> None:
-    """Raise an InputError if photos show the whole sphere, or two fisheye circles: they have no focal length.
+def is_panorama(file: Path, photo: Photo) -> bool:
+    """Whether a photo, stored in `file`, shows the whole sphere.
 
-    Args:
-        source: what the user gave: a folder or a video.
-        first: file of the first photo.
-        photo: its metadata.
+    Raises:
+        InputError: it shows two fisheye circles, which have no focal length.
     """
     if photo.width != 2 * photo.height or photo.focal is not None:
-        return
-    grey = image.read_levels(first)
+        return False
+    grey = image.read_levels(file)
     if panorama.fisheye_pair(grey):
-        raise InputError(source, "shows two fisheye circles side by side, as 360 cameras record them", panorama.STITCH)
-    if panorama.whole_sphere(grey):
-        raise InputError(
-            source, "shows 360 panoramas; here, lenses of perspective photos are solved",
-            "Give the video, or the folder as frames, to `scan2sim slam`, which tracks panoramas. If the photos are "
-            "perspective ones, give --focal (pixels)",
-        )  # fmt: skip
+        raise InputError(file, "shows two fisheye circles side by side, as 360 cameras record them", panorama.STITCH)
+    return panorama.whole_sphere(grey)
 
 
 def stage(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, str]:

@@ -85,11 +85,9 @@ def reconstruct(inputs: Inputs, params: Reconstructed, out: Path, report: Report
         photos, warnings = photos_io.read_photos(source, part(report, 0, 0.1))
         if "times" in inputs:
             photos = photos_io.with_times(photos, photos_io.list_photos(source), inputs["times"])
-    if params.focal is None:
-        photos_io.check_perspective(source, images / photos[0].name, photos[0])
     database, staged = checkpoint / "database.db", checkpoint / "images"
     names = photos_io.stage(photos, images, staged)
-    fixed = _extract(database, staged, photos, names, params, part(report, 0.1, 0.4))
+    fixed = _extract(database, images, staged, photos, names, params, part(report, 0.1, 0.4))
     exhaustive = params.matching == "exhaustive" or (
         params.matching == "auto" and not is_video and len(photos) <= EXHAUSTIVE_MAX
     )
@@ -159,30 +157,37 @@ def following_pairs(photos: Sequence[Photo]) -> Iterator[tuple[str, str]]:
 def _extract(
     database: Path,
     images: Path,
+    staged: Path,
     photos: Sequence[Photo],
     names: Mapping[str, str],
     params: Reconstructed,
     report: Report,
 ) -> list[int]:
-    """Extract the features of all photos, files `names` in `images`; returns the ids of cameras with fixed lenses."""
+    """Extract the features of all photos, files `names` in `staged`; returns the ids of cameras with fixed lenses."""
     groups: dict[Any, list[Photo]] = defaultdict(list)
     for photo in photos:
         groups[photo.camera].append(photo)
     fixed, done = [], 0
     for group in groups.values():
-        files, lens = [names[photo.name] for photo in group], lens_of(group[0], params)
-        camera: int = _call("add_photos", database, images, files, lens, hours=params.time_limit)
+        files, lens = [names[photo.name] for photo in group], lens_of(group[0], params, images / group[0].name)
+        camera: int = _call("add_photos", database, staged, files, lens, hours=params.time_limit)
         if lens.fixed:
             fixed.append(camera)
         for at in range(0, len(group), EXTRACT_CHUNK):
             report(done / len(photos), f"features of {group[at].name} ({done} of {len(photos)})")
-            _call("extract", database, images, files[at : at + EXTRACT_CHUNK], params.features, hours=params.time_limit)
+            _call("extract", database, staged, files[at : at + EXTRACT_CHUNK], params.features, hours=params.time_limit)
             done += len(files[at : at + EXTRACT_CHUNK])
     return fixed
 
 
-def lens_of(photo: Photo, params: Reconstructed) -> colmap.Lens:
-    """Lens of a photo by the options, or by EXIF."""
+def lens_of(photo: Photo, params: Reconstructed, file: Path) -> colmap.Lens | colmap.Panorama:
+    """Lens of a photo by the options, or by EXIF; a panorama has none.
+
+    Raises:
+        InputError: the photo shows two fisheye circles.
+    """
+    if params.focal is None and photos_io.is_panorama(file, photo):
+        return colmap.Panorama(photo.width, photo.height)
     centre = params.centre or ((photo.width - 1) / 2, (photo.height - 1) / 2)
     if params.focal is None:
         return colmap.Lens(photo.focal, centre, (params.k1 or 0.0,))
