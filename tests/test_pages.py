@@ -86,7 +86,9 @@ def source(module: str) -> str:
 
 def code_lines(text: str) -> Iterator[str]:
     """Lines of shell code blocks, with continuation lines joined, and inline code."""
-    for block in re.findall(r"```(?:sh)?\n(.*?)```", text, re.DOTALL):
+    for language, block in re.findall(r"```(\w*)[^\n]*\n(.*?)```", text, re.DOTALL):
+        if language not in ("", "sh"):
+            continue
         yield from re.sub(r"\\\n\s*", "", block).splitlines()
     yield from re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
 

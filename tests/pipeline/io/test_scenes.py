@@ -312,7 +312,7 @@ def test_usd_files_have_a_version_that_isaac_sim_4_reads(tmp_path: Path) -> None
     pytest.importorskip("pxr", reason="usd-core is not installed")
     code = (
         "from pathlib import Path; from scan2sim.pipeline.io.world_formats import usd; "
-        "usd._stage(Path('a.usdc')).GetRootLayer().Save()"
+        "stage = usd._stage(Path('a.usdc')); stage.GetRootLayer().Save()"
     )
     mine = {name: value for name, value in os.environ.items() if not name.startswith("USD_")}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, env=mine)  # OpenUSD reads its settings once
