@@ -254,7 +254,7 @@ def _check_log(path: Path) -> None:
     for file in path.glob("*.db3") if path.is_dir() else [path]:
         log = file.with_name(f"{file.name}-wal")
         if file.suffix == ".db3" and log.is_file() and log.stat().st_size:
-            cause = f"lacks messages that are still in {log.name}: the recording was interrupted"
+            cause = f"is incomplete: messages are still in {log.name}, as the recording was interrupted"
             raise InputError(
                 file, cause, f"Write them into the file: sqlite3 {file.name} 'PRAGMA wal_checkpoint(TRUNCATE)'"
             )
