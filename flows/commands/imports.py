@@ -191,7 +191,7 @@ def import_plain_clouds(
     clouds: Annotated[
         list[Path],
         typer.Argument(
-            metavar="CLOUD...", help="Point clouds: LAS, LAZ, COPC, PLY, E57, PCD, PTX, XYZ, CSV, or an ept.json."
+            metavar="CLOUD...", help="Point clouds: LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV, or an ept.json."
         ),
     ],
     out: TileOut,

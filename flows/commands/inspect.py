@@ -20,7 +20,7 @@ from scan2sim.pipeline.core.classes import name_of
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Frame, Tile
 from scan2sim.pipeline.importers.bag.reader import is_bag
-from scan2sim.pipeline.io import clouds, file_checks, foreign_files, xml
+from scan2sim.pipeline.io import clouds, file_checks, xml
 from scan2sim.pipeline.io.geodata.crs import name as crs_name
 from scan2sim.pipeline.io.mesh_files import find_mesh, is_mesh
 from scan2sim.pipeline.io.tile import read_tile
@@ -88,8 +88,9 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
     if path.name in readers:
         return readers[path.name]
     if path.suffix.lower() not in readers:
-        cause = f"has an unknown file type ({path.suffix or 'no suffix'})"
-        raise foreign_files.unread(path, cause, f"Known: {' '.join(readers)}")
+        raise InputError(
+            path, f"has an unknown file type ({path.suffix or 'no suffix'})", f"Known: {' '.join(readers)}"
+        )
     return readers[path.suffix.lower()]
 
 

@@ -17,7 +17,6 @@ EXTRA_OF = {
     "kiss_icp": "lidar",
     "pymeshlab": "meshlab",
     "pye57": "e57",
-    "pillow_heif": "heif",
     "zstandard": "ept",
     "prefect": "flows",
     "distributed": "flows",

@@ -4,7 +4,7 @@
 name = "my_street"
 crs = "EPSG:32633"          # code or WKT; "local" without georeference; default: the clouds' own
 units = "m"                 # "ft", "us-ft"; default: the unit of the CRS, else metres
-clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY, E57, PCD, PTX, XYZ, CSV; coordinates in that CRS and unit
+clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV; coordinates in that CRS and unit
 trajectory = "path.csv"     # optional: the scanner's path, time,x,y,z or with rotations (.csv, .tum)
 orthophoto = "ortho.tif"    # optional: GeoTIFF, or JPEG, PNG, TIFF with a world file; in the CRS
 footprints = "houses.gpkg"  # optional: building footprints, GeoJSON or GeoPackage

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -28,9 +27,9 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError, from_os_error
 from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import F64, Frame, Trajectory
-from scan2sim.pipeline.io import file_checks, foreign_files, tables
+from scan2sim.pipeline.io import file_checks, tables
 from scan2sim.pipeline.io.geodata import crs as crs_io
-from scan2sim.pipeline.io.trajectory_columns import MATRIX, UNNAMED, is_number, named, seconds, unnamed
+from scan2sim.pipeline.io.trajectory_columns import MATRIX, is_number, named, seconds, unnamed
 
 POSITION_COLUMNS = ("time", "x", "y", "z")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
@@ -169,12 +168,7 @@ def _lines(path: Path) -> tuple[str, Lines]:
     kind = path.suffix.lower()
     if kind == ".geojson":
         raise InputError(path, "is GeoJSON, which can only be written", "Give the .csv beside it")
-    file_checks.check(path)
-    try:
-        text = tables.read_text(path)
-    except InputError as error:  # binary, such as SBET
-        raise foreign_files.unread(path, error.cause, error.remedy) from None
-    filled = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    filled = [(i, line) for i, line in enumerate(tables.read_text(path).splitlines(), 1) if line.strip()]
     plain = [(i, line) for i, line in filled if not line.lstrip().startswith("#")]
     if not plain:
         raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES.get(kind, REMEDIES[".csv"]))
@@ -184,23 +178,11 @@ def _lines(path: Path) -> tuple[str, Lines]:
         kind = ".csv" if delimiter in (",", ";") else {8: ".tum", 12: ".kitti"}.get(width, ".csv")
     if kind != ".csv" and not is_number(plain[0][1].split()[0]):
         kind = ".csv"  # a header line without #
-    if kind == ".tum" and (names := _other_order([line for _, line in filled[: filled.index(plain[0])]])):
-        kind, plain = ".csv", [(0, (delimiter or " ").join(names)), *plain]
-    elif kind == ".csv":
+    if kind == ".csv":
         plain = filled[:1] + [line for line in plain if line not in filled[:1]]
     if decimal_commas:
         plain = [(i, line.replace(",", ".")) for i, line in plain]
     return kind, [(i, line.split(delimiter)) for i, line in plain]
-
-
-def _other_order(comments: Sequence[str]) -> list[str]:
-    """Names of the columns of TUM in another order (`# timestamp tx ty tz qw qx qy qz`); empty without any."""
-    for line in comments:
-        names = re.split(r"[,;\s]+", line.strip(" #%\t,;"))
-        found = named(names)
-        if len(found) == 8 and {*found} == {*UNNAMED[8]} and found != UNNAMED[8]:
-            return names
-    return []
 
 
 def _header_line(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:

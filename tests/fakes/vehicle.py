@@ -106,24 +106,20 @@ class DrivenEndpoint(ABC):
 
         def driven_and_what() -> bool:
             if not self.driven:
-                self.start(what)
+                self.start()
             return what()
 
         self.until(driven_and_what, controls, seconds)
 
-    def start(self, unless: Callable[[], bool] = lambda: False) -> None:
-        """Confirm a stop until the adapter has left it; begins again if orders were late, or it has stopped again.
-
-        Args:
-            unless: condition under which it may stand.
-        """
+    def start(self) -> None:
+        """Confirm a stop until the adapter has left it; begins again if orders were late, or it has stopped again."""
 
         def drives() -> bool:
             return self.driven and self.end.answer is not None and not self.end.answer.standing
 
         self.until(lambda: self.end.answer is not None)
         end = self.clock() + 60
-        while not (unless() or drives()):
+        while not drives():
             assert self.clock() < end, self.end.answer
             self.driven = False
             for _ in range(5):

@@ -522,9 +522,8 @@ def test_versions_include_all_packages_that_steps_use(monkeypatch: pytest.Monkey
     computing |= {package for package, extra in EXTRA_OF.items() if extra not in EXTRAS_WITHOUT_STEPS} - {
         "pxr",
         "kiss_icp",
-        "pillow_heif",
     }
-    computing |= {"usd-core", "kiss-icp", "pillow-heif"}
+    computing |= {"usd-core", "kiss-icp"}
     assert computing <= found.keys()
     assert found["scan2sim"] == scan2sim.__version__ and not {"prefect", "ray", "s3fs", "pytest"} & found.keys()
 
