@@ -48,7 +48,7 @@ OTHER_PROGRAMS = re.compile(
 )
 """Other programs, whose options a page may mention if it also shows them in a command."""
 IMAGES, ARRAYS, MESHES = {"png", "jpg"}, {"npz", "npy", "laz", "csv"}, {"obj", "mtl", "dae", "glb", "sdf"}
-SUFFIXES = {"py", "js", "json", "geojson", "toml", *IMAGES, *ARRAYS, *MESHES}
+SUFFIXES = {"py", "js", "json", "md", "geojson", "toml", *IMAGES, *ARRAYS, *MESHES}
 
 
 def text_of(page: Path) -> str:
