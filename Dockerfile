@@ -27,13 +27,15 @@ FROM system AS gpu
 ENV NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility
 COPY --from=gpu-environment /opt/venv /opt/venv
 COPY --from=gpu-environment /app /app
-USER scan2sim
+# scan2sim, as a number: Kubernetes can't check that a name isn't root
+USER 1000
 ENTRYPOINT ["/app/deploy/entrypoint"]
 CMD ["--help"]
 
 FROM system AS cpu
 COPY --from=cpu-environment /opt/venv /opt/venv
 COPY --from=cpu-environment /app /app
-USER scan2sim
+# scan2sim, as a number: Kubernetes can't check that a name isn't root
+USER 1000
 ENTRYPOINT ["/app/deploy/entrypoint"]
 CMD ["--help"]

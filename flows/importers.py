@@ -58,7 +58,7 @@ def import_clouds(
         crs: "EPSG:32633" or WKT, "local" without georeference; takes precedence over the clouds' own, the default.
         units: "m", "ft" or "us-ft"; takes precedence over the unit of the CRS, the default.
         axes: order of the clouds' coordinates, a permutation of "enh" (easting, northing, height), the default.
-        trajectory: the scanner's path: .csv (a header line, then time,x,y,z per line) or .tum.
+        trajectory: the scanner's path: .csv (a header line, then time,x,y,z per line), .tum or SBET.
         pose_source: "given" uses cloud and trajectory as they are; "auto" checks whether surfaces that were scanned at
             different times agree, and corrects them if they agree clearly better then; "fused" always corrects them.
         orthophoto: GeoTIFF, or an image with a world file, in the clouds' CRS.

@@ -1,12 +1,13 @@
-"""Classification of photos of any camera and size by a network: angular resampling, tiling, panorama wrap-around."""
+"""Classification of photos by a network: turned upright, angular resampling, tiling, panorama wrap-around."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
-from scan2sim.pipeline.core.types import F32, U8, Camera
+from scan2sim.pipeline.core.types import F32, U8, Camera, View
 from scan2sim.segmentation.backends import Network
 from scan2sim.segmentation.labels import CLASSES, IGNORED, map_labels
 from scan2sim.segmentation.lidar_channels import CHANNELS
@@ -21,6 +22,20 @@ OUTPUT_STRIDE = 4
 """Probabilities are stored at 1/4 of the resolution at which photos are classified."""
 MAX_UPSCALING = 1.6
 """Largest factor by which photos are enlarged."""
+
+SIDEWAYS_MIN = 0.5
+"""Least cosine between a photo's plane and the vertical; cameras that look more steeply have no upright photo."""
+
+
+def quarter_turns(view: View) -> int:
+    """Counter-clockwise quarter turns (`np.rot90`) that make a photo upright: of a camera on its side, or a portrait.
+
+    0 for panoramas, and for cameras that look almost straight up or down.
+    """
+    x, y, _ = view.T_world_cam[2, :3]  # up, in the camera's axes
+    if view.camera.model == "equirectangular" or math.hypot(x, y) < SIDEWAYS_MIN:
+        return 0
+    return round(math.atan2(x, -y) / (math.pi / 2)) % 4
 
 
 class Classifier:
@@ -45,16 +60,22 @@ class Classifier:
         self.takes_channels = network.info.channels
         self.tile = MAX_TILE_PX
 
-    def probabilities(self, rgb: U8, camera: Camera, channels: U8 | None = None) -> U8:
+    def probabilities(self, rgb: U8, camera: Camera, channels: U8 | None = None, turns: int = 0) -> U8:
         """(h, w, C) uint8 probabilities (255 for 1) by class of `CLASSES`, at 1/`OUTPUT_STRIDE` of `size`.
 
         Args:
             rgb: (H, W, 3) whole photo.
             camera: intrinsics of the photo.
             channels: (h, w, 4) lidar channels of the photo; None if there is no scan.
+            turns: quarter turns (`quarter_turns`) by which the photo is turned for the network, and back.
         """
         import cv2
 
+        if turns:
+            upright = np.ascontiguousarray(np.rot90(rgb, turns))
+            turned = replace(camera, width=upright.shape[1], height=upright.shape[0])
+            channels = None if channels is None else np.rot90(channels, turns)
+            return np.ascontiguousarray(np.rot90(self.probabilities(upright, turned, channels), -turns))
         wide = camera.model == "equirectangular"
         size = self.size(camera)
         image = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if size[0] < camera.width else cv2.INTER_LINEAR)

@@ -219,26 +219,25 @@ def compare(
         passes: (K,) whether they are of different passes.
         report: receives progress.
     """
-    surfaces: dict[int, Surface] = {}
-    kept, rows = [], []
-    for k, (i, j) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
-        report(k / len(first), f"pair {k + 1} of {len(first)}")
-        if i not in surfaces:
-            if len(surfaces) > 8:
-                surfaces.pop(next(iter(surfaces)))
-            surfaces[i] = surface_of(sweep(i))
-        given = inverse(poses[i]) @ poses[j]
-        found = register(sweep(j), surfaces[i], given, tilt=bool(passes[k]))
-        if found is not None:
-            correction = found.T @ inverse(given)
-            turn = float(np.linalg.norm(correction[:3, :3] - np.eye(3)) / np.sqrt(2))
-            shift = float(np.linalg.norm(found.T[:3, 3] - given[:3, 3]))
-            rows.append((found.T, found.covariance, np.hypot(shift, turn * MODEL.lever_m), found.residual))
-            kept.append(k)
-    count = len(rows)
+    rows: dict[int, tuple[F64, F64, float, float]] = {}
+    sweeps = np.unique(first).tolist()
+    for done, i in enumerate(sweeps):
+        report(done / len(sweeps), f"sweep {done + 1} of {len(sweeps)}")
+        surface = surface_of(sweep(i))
+        for k in np.flatnonzero(first == i).tolist():
+            j = int(second[k])
+            given = inverse(poses[i]) @ poses[j]
+            found = register(sweep(j), surface, given, tilt=bool(passes[k]))
+            if found is not None:
+                correction = found.T @ inverse(given)
+                turn = float(np.linalg.norm(correction[:3, :3] - np.eye(3)) / np.sqrt(2))
+                shift = float(np.linalg.norm(found.T[:3, 3] - given[:3, 3]))
+                rows[k] = (found.T, found.covariance, np.hypot(shift, turn * MODEL.lever_m), found.residual)
+    kept = sorted(rows)
+    count = len(kept)
     return Pairs(
         first[kept], second[kept],
-        np.array([row[0] for row in rows]).reshape(count, 4, 4),
-        np.array([row[1] for row in rows]).reshape(count, 6, 6),
-        np.array([row[2] for row in rows]), np.array([row[3] for row in rows]), passes[kept],
+        np.array([rows[k][0] for k in kept]).reshape(count, 4, 4),
+        np.array([rows[k][1] for k in kept]).reshape(count, 6, 6),
+        np.array([rows[k][2] for k in kept]), np.array([rows[k][3] for k in kept]), passes[kept],
     )  # fmt: skip

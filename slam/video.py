@@ -11,11 +11,15 @@ from typing import Any
 
 import numpy as np
 
+from scan2sim.pipeline.camera.panorama import STITCH
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images.image import SUFFIXES, read_levels
+
+UNSTITCHED = (".insv", ".360")
+"""Suffixes of what 360 cameras record: fisheye circles (Insta360), faces of a cube (GoPro)."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Video:
 
     Attributes:
         path: video file or folder.
-        width, height: size of the first frame, pixels.
+        width, height: size of the first frame, pixels, upright.
         count: number of frames by the file's metadata; None if unknown.
         fps: frames per second by the file's metadata, or as given for a folder.
         start: UNIX time of the first frame by the file's metadata; None if unknown.
@@ -55,6 +59,10 @@ class Video:
     def first(self) -> Path:
         """First image of a folder."""
         return _files(self.path)[0]
+
+    def first_grey(self) -> U8:
+        """First frame (H, W), grey."""
+        return next(self.frames()).grey
 
     def frames(self, *, every: int = 1, warn: Callable[[str], None] = lambda _: None) -> Iterator[Frame]:
         """Every Nth frame, N = `every`.
@@ -96,18 +104,23 @@ def open_video(path: Path, *, fps: float = 10.0, times: Path | None = None) -> V
         return _folder(path, fps, times)
     if not path.is_file():
         raise InputError(path, "file not found", "Check the path; give a video file, or a folder of images")
+    if path.suffix.lower() in UNSTITCHED:
+        raise InputError(path, "is an unstitched recording of a 360 camera", STITCH)
     av = _av()
     try:
         with av.open(str(path.absolute())) as container:  # FFmpeg takes `12:30.mp4` for an address
-            if not container.streams.video or container.streams.video[0].codec_context is None:
+            stream = _main_stream(container)
+            if stream is None or stream.codec_context is None:
                 raise InputError(path, "has no readable video stream", "Give a video file, or a folder of images")
-            stream = container.streams.video[0]
+            first = next(container.decode(stream), None)
+            if first is None:
+                raise InputError(path, "has no readable frame", "Copy or convert it again")
+            height, width = upright(np.zeros((first.height, first.width), np.uint8), first).shape
             rate = float(stream.average_rate or stream.base_rate or 30)
             count = stream.frames or (round(stream.duration * stream.time_base * rate) if stream.duration else None)
             start = _start(container.metadata.get("creation_time") or stream.metadata.get("creation_time"))
             focal = _focal(container.metadata | stream.metadata)
-            size = stream.codec_context.width, stream.codec_context.height
-            return Video(path, *size, count, rate, start, None, focal)
+            return Video(path, width, height, count, rate, start, None, focal)
     except (av.error.FFmpegError, UnicodeDecodeError) as error:
         raise InputError(path, f"isn't a readable video ({error})", "Copy or convert it again") from None
 
@@ -169,9 +182,22 @@ def _of_folder(video: Video) -> Iterator[Frame]:
 
 
 def _of_file(video: Video, warn: Callable[[str], None]) -> Iterator[Frame]:
+    for number, (time, frame) in enumerate(decode(video, warn)):
+        yield Frame(number, time, upright(_grey(frame), frame), f"{number:06d}")
+
+
+def decode(video: Video, warn: Callable[[str], None]) -> Iterator[tuple[float, Any]]:
+    """Decode a video file: seconds since the first frame, and PyAV's frame.
+
+    `warn` receives a warning if the file can't be read to its end, or holds further videos.
+    """
     av = _av()
     with av.open(str(video.path.absolute())) as container:
-        stream = container.streams.video[0]
+        stream = _main_stream(container)
+        pictures = [s for s in container.streams.video if not s.disposition & av.stream.Disposition.attached_pic]
+        if len(pictures) > 1:
+            used = f"the one of {stream.codec_context.width}x{stream.codec_context.height} is used"
+            warn(f"the file holds {len(pictures)} videos; {used}")
         stream.thread_type = "AUTO"
         first: float | None = None
         number = 0
@@ -179,11 +205,20 @@ def _of_file(video: Video, warn: Callable[[str], None]) -> Iterator[Frame]:
             for frame in container.decode(stream):
                 time = float(frame.pts * frame.time_base) if frame.pts is not None else number / video.fps
                 first = time if first is None else first
-                grey = _grey(frame)
-                yield Frame(number, time - first, grey, f"{number:06d}")
+                yield time - first, frame
                 number += 1
         except av.error.FFmpegError as error:
             warn(f"the video can't be read beyond frame {number} ({error})")
+
+
+def upright(pixels: U8, frame: Any) -> U8:
+    """Pixels (H, W, ...) of PyAV's frame, turned as players show it: phones store portraits on their side."""
+    return np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90)))
+
+
+def _main_stream(container: Any) -> Any:
+    """The video, not a cover picture or a thumbnail; None without one."""
+    return container.streams.best("video")
 
 
 def _grey(frame: Any) -> U8:

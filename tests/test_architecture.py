@@ -73,13 +73,8 @@ def import_graph() -> dict[str, set[str]]:
     known = project_files()
 
     def wanted(file: Path) -> set[str]:
-        found = set()
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            names = [alias.name for alias in node.names] if isinstance(node, (ast.Import, ast.ImportFrom)) else []
-            of = f"{node.module}." if isinstance(node, ast.ImportFrom) else ""
-            for name in (f"{of}{name}".removeprefix("scan2sim.") for name in names):
-                found |= {next((n for n in (name, name.rpartition(".")[0]) if n in known), "")}
-        return found - {""}
+        names = (name.removeprefix("scan2sim.") for name in modules(file))
+        return {next((n for n in (name, name.rpartition(".")[0]) if n in known), "") for name in names} - {""}
 
     return {name: wanted(file) - {name} for name, file in known.items()}
 

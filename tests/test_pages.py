@@ -44,11 +44,11 @@ PAGES = [
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 PARAMS: dict[str, type[Params]] = {step.name: step.params for step in STEPS}
 OTHER_PROGRAMS = re.compile(
-    r"\b(prefect|docker|dask|ray|gz|gz_args|pip|aws|curl|kubectl|trtexec|esmini|ros2|export.py)\b"
+    r"\b(prefect|docker|dask|ray|gz|gz_args|pip|aws|curl|kubectl|SBATCH|srun|trtexec|esmini|ros2|export.py)\b"
 )
 """Other programs, whose options a page may mention if it also shows them in a command."""
 IMAGES, ARRAYS, MESHES = {"png", "jpg"}, {"npz", "npy", "laz", "csv"}, {"obj", "mtl", "dae", "glb", "sdf"}
-SUFFIXES = {"py", "js", "json", "geojson", "toml", *IMAGES, *ARRAYS, *MESHES}
+SUFFIXES = {"py", "js", "json", "md", "geojson", "toml", *IMAGES, *ARRAYS, *MESHES}
 
 
 def text_of(page: Path) -> str:
@@ -86,7 +86,9 @@ def source(module: str) -> str:
 
 def code_lines(text: str) -> Iterator[str]:
     """Lines of shell code blocks, with continuation lines joined, and inline code."""
-    for block in re.findall(r"```(?:sh)?\n(.*?)```", text, re.DOTALL):
+    for language, block in re.findall(r"```(\w*)[^\n]*\n(.*?)```", text, re.DOTALL):
+        if language not in ("", "sh"):
+            continue
         yield from re.sub(r"\\\n\s*", "", block).splitlines()
     yield from re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
 

@@ -85,7 +85,7 @@ def texture(inputs: Inputs, params: TextureParams, out: Path, report: Report) ->
     `cloud.*` (coloured points; `cloud.rest`, the classes without a surface, is not used for colours), `raw.*`
     (points that `cloud.*` were thinned from, used instead if they are coloured; optional), `uncovered` (thinned points
     that photos don't cover, optional), `synthesized.*` (synthesized points, optional), `instances` (GeoJSON of the
-    removed vehicles and people, optional),
+    removed vehicles and people, optional), `colour_source` (of a robot's map: step `map_colours`, optional),
     `source_mesh` (the textured mesh that the tile was made from, optional: its texture counts as a photo).
     File: `textured`, a folder with `mesh.npz`, `page_<i>.png` and `page_<i>_seen.png` (255 seen by a photo,
     128 coloured from points, 64 filled from neighbours or by class, 0 no surface).

@@ -13,6 +13,6 @@ FROM python:3.11-slim
 RUN useradd --create-home --uid 1000 scan2sim
 COPY --from=environment /opt/venv /opt/venv
 ENV PATH=/opt/venv/bin:$PATH PYTHONUNBUFFERED=1
-USER scan2sim
+USER 1000
 WORKDIR /home/scan2sim
 EXPOSE 8080

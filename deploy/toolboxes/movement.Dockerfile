@@ -4,6 +4,6 @@ FROM scan2sim-toolbox
 COPY constraints.txt deploy/toolboxes/movement.txt /requirements/
 USER root
 RUN pip install --no-cache-dir -c /requirements/constraints.txt -r /requirements/movement.txt
-USER scan2sim
+USER 1000
 HEALTHCHECK --interval=10s --timeout=5s --start-period=60s CMD ["python", "-m", "scan2sim.services.http.healthcheck"]
 ENTRYPOINT ["scan2sim", "toolbox", "serve", "movement", "--host", "0.0.0.0"]

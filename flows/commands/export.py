@@ -118,5 +118,10 @@ def export_world(
         _warn_of_exceeded_budget(small, limits)
     if scene.frame.crs == LOCAL:
         warn(f"{scene.name} has no CRS: the export is not georeferenced")
+    if "carla" in formats and not any((out / "carla").rglob("*.xodr")):
+        warn(
+            f"{scene.name} has no roads with lanes, so CARLA's map has no OpenDRIVE: waypoints, the traffic manager "
+            "and pedestrians don't work there (docs/roads.md)"
+        )
     console.print(f"World:  {out}", highlight=False, soft_wrap=True)
     return out

@@ -191,7 +191,7 @@ def import_plain_clouds(
     clouds: Annotated[
         list[Path],
         typer.Argument(
-            metavar="CLOUD...", help="Point clouds: LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV, or an ept.json."
+            metavar="CLOUD...", help="Point clouds: LAS, LAZ, COPC, PLY, E57, PCD, PTX, XYZ, CSV, or an ept.json."
         ),
     ],
     out: TileOut,
@@ -217,7 +217,7 @@ def import_plain_clouds(
     ] = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(help="The scanner's path: .csv (time,x,y,z) or .tum; checked, see --pose-source."),
+        typer.Option(help="The scanner's path: .csv (time,x,y,z), .tum or SBET; checked, see --pose-source."),
     ] = None,
     pose_source: PoseSource = "auto",
     orthophoto: Annotated[

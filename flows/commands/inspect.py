@@ -20,7 +20,7 @@ from scan2sim.pipeline.core.classes import name_of
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Frame, Tile
 from scan2sim.pipeline.importers.bag.reader import is_bag
-from scan2sim.pipeline.io import clouds, file_checks, xml
+from scan2sim.pipeline.io import clouds, file_checks, foreign_files, sbet, xml
 from scan2sim.pipeline.io.geodata.crs import name as crs_name
 from scan2sim.pipeline.io.mesh_files import find_mesh, is_mesh
 from scan2sim.pipeline.io.tile import read_tile
@@ -87,10 +87,11 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
     }  # fmt: skip
     if path.name in readers:
         return readers[path.name]
+    if sbet.is_sbet(path):
+        return _sbet
     if path.suffix.lower() not in readers:
-        raise InputError(
-            path, f"has an unknown file type ({path.suffix or 'no suffix'})", f"Known: {' '.join(readers)}"
-        )
+        cause = f"has an unknown file type ({path.suffix or 'no suffix'})"
+        raise foreign_files.unread(path, cause, f"Known: {' '.join(readers)}")
     return readers[path.suffix.lower()]
 
 
@@ -127,6 +128,22 @@ def _cloud(path: Path) -> tuple[str, Facts]:
             for i, (code, count) in enumerate(zip(codes.tolist(), counts.tolist(), strict=True))
         ]
     return "cloud", facts
+
+
+def _sbet(path: Path) -> tuple[str, Facts]:
+    found = sbet.describe(path)
+    facts: Facts = [
+        ("records", f"{found.records:,} at {found.rate_hz:.0f} Hz"),
+        ("times", f"{found.times[0]:,.1f} to {found.times[1]:,.1f} s"),
+        *(
+            (name, f"{low:.{digits}f} to {high:.{digits}f}")
+            for name, (low, high), digits in (
+                ("latitude", found.latitude, 6), ("longitude", found.longitude, 6), ("height", found.height, 1),
+            )
+        ),
+        ("use", "the scanner's path: `import clouds CLOUD --trajectory` or `import sweeps SWEEPS`"),
+    ]  # fmt: skip
+    return "SBET trajectory", facts
 
 
 def _mistake(tile: Tile) -> str | None:

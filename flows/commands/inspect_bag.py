@@ -26,7 +26,7 @@ def show_bag(path: Path, urdf: Path | None = None) -> None:
     """
     with opened(path) as bag:
         found = inspected(bag)
-        uses, error = described(found, BagParams.model_validate({}), urdf)
+        uses, warnings, error = described(found, BagParams.model_validate({}), urdf)
         with progress("inspect") as report:
             numbers = statistics(bag, report)
         start = datetime.fromtimestamp(bag.start_ns / 1e9, UTC)
@@ -46,6 +46,8 @@ def show_bag(path: Path, urdf: Path | None = None) -> None:
             )  # fmt: skip
     console.print(f"[bold]{escape(title)}", highlight=False, soft_wrap=True)
     console.print(table, highlight=False)
+    for text in warnings:
+        warn(text)
     if error is not None:
         warn(f"`scan2sim import bag` would stop: {error}")
 

@@ -35,7 +35,7 @@ from scan2sim.flows.reports.publish import to_read
 from scan2sim.flows.reports.side_products import SideProducts
 from scan2sim.pipeline.core import system_libs
 from scan2sim.pipeline.core.cache import Digests, Manifest, Store
-from scan2sim.pipeline.core.errors import ScanError, SettingError, SpaceError, StepError
+from scan2sim.pipeline.core.errors import ScanError, SettingError, SpaceError, StepError, WorkerError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.remote import Remote, is_remote, local_copy
 from scan2sim.pipeline.core.types import Tile
@@ -73,7 +73,11 @@ def survey(
     hold_out: HoldOut = None,
     jobs: Annotated[
         int,
-        typer.Option(min=0, help="Steps that run at the same time; 0: one for every two cores, as free memory allows."),
+        typer.Option(
+            min=0,
+            help="Steps that run at the same time; 0: one for every two cores, as free memory allows; "
+            "with --address, as many as its workers.",
+        ),
     ] = 0,
     memory: Annotated[
         str | None, typer.Option(help="Memory that all running steps may use together, such as 20GB.")
@@ -96,7 +100,7 @@ def survey(
         require(f"--runner {runner}", "prefect")
         workers.check(runner)
         as_flow: Callable[..., object] = context.obj
-        jobs = jobs or default_jobs()
+        jobs = jobs or (0 if address and runner != "threads" else default_jobs())
         as_flow(source, out, length, buffer, settings.values, runner, jobs, memory, cores, address, bus)
 
 
@@ -250,20 +254,23 @@ def _run_tiles(
     side_failed: dict[TaskId, ScanError] = {}
     ran: dict[tuple[TaskId, str], Reason] = {}  # reasons of tasks that an earlier round of this run executed
     before: dict[TaskId, set[str]] = {}  # contents of the results that existed before each task ran
-    first = plan_survey(tiles, store, settings, digests)
-    for name in tiles:
-        own_tasks = [item for item in first if item.task.tile == name]
+    planned = plan_survey(tiles, store, settings, digests)
+    damaged = False
+    for name, own_tasks in _by_tile(planned).items():
         if not is_finished(store.within(name), own_tasks, out / TILES / name):
-            drop_damaged(own_tasks, store, to_read(store.within(name), own_tasks, out / TILES / name))
+            read = to_read(store.within(name), own_tasks, out / TILES / name)
+            damaged |= drop_damaged(own_tasks, store, read)
+    again = damaged  # planning takes minutes for a thousand tiles on a network drive
     while True:
-        planned = plan_survey(tiles, store, settings, digests, side_failed)
+        planned = plan_survey(tiles, store, settings, digests, side_failed) if again else planned
+        again = True
         planned = [replace(item, reason=item.reason or ran.get((item.task.id, item.key))) for item in planned]
         ran |= {(item.task.id, item.key): item.reason for item in planned if item.reason is not None}
         for task in {item.task.id for item in planned if item.reason is not None} - before.keys():
             before[task] = store.contents(task.full_name)
         outcome = run(planned, store)
         for error in outcome.failed.values():
-            if isinstance(error, (SpaceError, SettingError)):  # not the fault of a single tile
+            if isinstance(error, (SpaceError, SettingError, WorkerError)):  # not the fault of a single tile
                 raise error
         side_failed |= outcome.side_failed
         if not (outcome.failed or outcome.side_failed):
@@ -272,19 +279,28 @@ def _run_tiles(
             failed.setdefault(task.tile, error)
         tiles = {name: tile for name, tile in tiles.items() if name not in failed}
     side.add({task: error for task, error in side_failed.items() if task.tile in tiles}, outcome.done)
+    by_tile = _by_tile(planned)
     return [
         TileResult(name, None if name in unread else read_tile(path), error=failed[name])
         if name in failed
-        else TileResult(name, tiles[name], *_tile_result_parts(name, planned, outcome, before))
+        else TileResult(name, tiles[name], *_tile_result_parts(name, by_tile.get(name, []), outcome, before))
         for name, path in survey.tiles.items()
     ]
+
+
+def _by_tile(planned: Sequence[PlannedTask]) -> dict[str, list[PlannedTask]]:
+    """The tasks of each tile, in the plan's order."""
+    found: dict[str, list[PlannedTask]] = {}
+    for item in planned:
+        found.setdefault(item.task.tile, []).append(item)
+    return found
 
 
 def _tile_result_parts(
     name: str, planned: Sequence[PlannedTask], outcome: Outcome, before: Mapping[TaskId, set[str]]
 ) -> tuple[tuple[PlannedTask, ...], dict[str, Manifest], bool]:
-    """A tile's tasks, their results by name within the tile, and whether any result differs from `before`."""
-    own_tasks = tuple(item for item in planned if item.task.tile == name)
+    """A tile's planned tasks, their results by name within it, and whether any result differs from `before`."""
+    own_tasks = tuple(planned)
     ran = before.keys() & {item.task.id for item in own_tasks}
     return own_tasks, outcome.of_tile(name), any(outcome.done[task].content not in before[task] for task in ran)
 

@@ -12,7 +12,7 @@ from prefect.states import Completed
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import changes
 from scan2sim.flows.deployed.survey import survey
-from scan2sim.flows.deployed.tile import WITH_WARNINGS, prefect_executor
+from scan2sim.flows.deployed.tile import WITH_WARNINGS, absolute, prefect_executor
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.pipeline.core.errors import BusyError
@@ -28,6 +28,7 @@ def reprocess(
 
     Does nothing if nothing has changed, or if the previous run is still running.
     """
+    source, out = absolute("source", source), absolute("out", out)
     try:
         with published(bus, "reprocess", source, local=False) as on_bus:
             run = prefect_executor(runner, workers, address, memory, cores, on_bus)

@@ -14,7 +14,7 @@ from prefect.states import Completed
 
 from scan2sim.flows.commands.drive import survey_of
 from scan2sim.flows.commands.survey import make_survey
-from scan2sim.flows.deployed.tile import artifact_key, prefect_executor, with_warnings
+from scan2sim.flows.deployed.tile import absolute, artifact_key, optional_artifact, prefect_executor, with_warnings
 from scan2sim.flows.engine.progress import published
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.flows.reports.survey import PAGE, overview, rows
@@ -24,11 +24,15 @@ from scan2sim.pipeline.core.remote import local_copy
 
 def publish(out: Path) -> None:
     """Publish the states and metrics of the tiles and an image as artifacts of the flow run."""
-    create_markdown_artifact(overview(out), key=artifact_key("survey", out.name), description="tiles by state")
-    create_table_artifact(rows(out), key=artifact_key("tiles", out.name), description="metrics of all tiles")
+    summary, table = overview(out), rows(out)
+    with optional_artifact():
+        create_markdown_artifact(summary, key=artifact_key("survey", out.name), description="tiles by state")
+    with optional_artifact():
+        create_table_artifact(table, key=artifact_key("tiles", out.name), description="metrics of all tiles")
     for picture in sorted(out.glob("tiles/*/picture.jpg"))[:1]:
         pixels = base64.b64encode(picture.read_bytes()).decode()
-        create_image_artifact(f"data:image/jpeg;base64,{pixels}", key=artifact_key("picture", out.name))
+        with optional_artifact():
+            create_image_artifact(f"data:image/jpeg;base64,{pixels}", key=artifact_key("picture", out.name))
 
 
 @flow(name="survey")
@@ -47,12 +51,13 @@ def survey(
         length, buffer: tile length and overlap in metres if the source is cut; default: of the drive, or 100 and 5.
         settings: by step, as in a settings file.
         runner: "threads", "dask" or "ray": where steps run (`engine.workers`).
-        workers: number of steps that run at the same time.
+        workers: number of steps that run at the same time; 0, with an address: as many as its workers.
         memory: limit of the memory of all steps on one machine, "20GB".
         cores: CPU cores per step; default: all.
         address: of a Dask scheduler or a Ray cluster; default: start one here.
         bus: where the flow and its workers publish progress (`services.monitoring.events.event_publishers`).
     """
+    source, out = absolute("source", source), absolute("out", out)
     try:
         with published(bus, "survey", source, local=False) as on_bus:
             run = prefect_executor(runner, workers, address, memory, cores, on_bus)

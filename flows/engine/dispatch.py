@@ -11,10 +11,12 @@ from typing import Any, Protocol
 from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.engine.ready_queue import Event, EventCallback, Outcome, ReadyQueue, ignore_event
 from scan2sim.flows.pipelines.graph import Task, TaskId
-from scan2sim.pipeline.core.cache import Store
-from scan2sim.pipeline.core.errors import DamagedError, ScanError, StepError
+from scan2sim.pipeline.core.cache import Manifest, Store
+from scan2sim.pipeline.core.errors import DamagedError, ScanError, StepError, WorkerError
 
 PROGRESS_INTERVAL_S = 1.0  # seconds between updates of `show`, which may take a tenth of a second
+VISIBLE_INTERVAL_S, VISIBLE_ATTEMPTS = 1.0, 60
+"""Pause and number of attempts to see a worker's result: NFS caches for up to a minute that a file is absent."""
 
 
 class Future(Protocol):
@@ -34,6 +36,8 @@ def dispatch(
     max_submitted: int,
     show: Callable[[str, float], None],
     on_event: EventCallback = ignore_event,
+    *,
+    sleep: Callable[[float], None] = time.sleep,
 ) -> Outcome:
     """Submit the tasks of a plan without cached results, each once its inputs exist.
 
@@ -46,6 +50,7 @@ def dispatch(
         max_submitted: maximum number of submitted tasks that have not ended.
         show: receives the name of a tile and the percentage of its finished tasks, at most once per second.
         on_event: receives the events of tasks that the submitting process knows; workers publish start and progress.
+        sleep: pauses for some seconds.
     """
     tile_progress = TileProgress(planned, show)
 
@@ -57,6 +62,7 @@ def dispatch(
     queue = ReadyQueue(planned, store, track)
     running: dict[TaskId, tuple[PlannedTask, Future]] = {}
     ended: SimpleQueue[TaskId] = SimpleQueue()
+    attempts = VISIBLE_ATTEMPTS
     while queue or running:
         for item in queue.ready():
             if len(running) >= max_submitted:
@@ -73,18 +79,56 @@ def dispatch(
             if isinstance(outcome, DamagedError):
                 queue.rebuild_damaged(item, outcome)
                 continue
-            name = item.task.full_name
-            manifest = None if isinstance(outcome, BaseException) else store.find(name, item.key)
+            if isinstance(outcome, BaseException):
+                manifest = _finished_elsewhere(item, store)
+            else:
+                manifest = _visible(item, store, attempts, sleep)
+                attempts = 1 if manifest is None else attempts  # the next ones won't appear, either
             if manifest is not None:
                 queue.end(item, manifest)
             else:
-                cause = f"its worker failed ({type(outcome).__name__}: {outcome})"
-                lost = StepError(
-                    name, cause, "Run again: finished steps are not repeated; the worker's log has the details"
-                )
-                queue.fail(item, outcome if isinstance(outcome, ScanError) else lost)
+                queue.fail(item, _error(item, store, outcome))
     tile_progress.flush()
     return queue.outcome
+
+
+def _finished_elsewhere(item: PlannedTask, store: Store) -> Manifest | None:
+    """The result of a failed task from a worker that had lost its network, and so its step to another one, if any."""
+    found = None if item.ignores_cache else store.find(item.task.full_name, item.key)
+    return None if found is None or found.failed else found
+
+
+def _visible(item: PlannedTask, store: Store, attempts: int, sleep: Callable[[float], None]) -> Manifest | None:
+    """The result that a worker has written, once this machine sees it; None if it doesn't appear."""
+    name = item.task.full_name
+    for _ in range(attempts):
+        manifest = store.find(name, item.key)
+        if manifest is None:
+            store.revalidate(name, item.key)
+            manifest = store.find(name, item.key)
+        if manifest is not None:
+            return manifest
+        sleep(VISIBLE_INTERVAL_S)
+    return None
+
+
+def _error(item: PlannedTask, store: Store, outcome: object) -> ScanError:
+    """The error of a task whose result doesn't exist, from what its future returned."""
+    name = item.task.full_name
+    if isinstance(outcome, ScanError):
+        return outcome
+    if isinstance(outcome, BaseException):
+        cause = f"its worker failed ({type(outcome).__name__}: {outcome})"
+        remedy = (
+            "After an update, restart all workers. Run again: finished steps aren't repeated; the worker's log has more"
+        )
+        return StepError(name, cause, remedy)
+    return WorkerError(
+        store.folder(name, item.key),
+        "a worker reports this result, but it doesn't appear on this machine",
+        "Mount the disk of --out at the same path on all machines, let workers run as the same user, or use object "
+        "storage for --out",
+    )
 
 
 def _notify(ended: SimpleQueue[TaskId], task: TaskId, _: object) -> None:

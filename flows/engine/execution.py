@@ -13,12 +13,13 @@ from scan2sim.flows.engine.memory import expected_memory, reserve_memory
 from scan2sim.flows.engine.planning import PlannedTask, check
 from scan2sim.flows.engine.progress import Channel, published_step
 from scan2sim.flows.engine.ready_queue import EventCallback, Outcome, ReadyQueue
+from scan2sim.flows.engine.shared_disk import SharedDisk
 from scan2sim.flows.engine.versions import check_version
 from scan2sim.flows.pipelines.graph import TaskId
 from scan2sim.pipeline.core import system_libs
 from scan2sim.pipeline.core.cache import Manifest, Store
 from scan2sim.pipeline.core.cores import THREAD_VARIABLES
-from scan2sim.pipeline.core.errors import DamagedError, ScanError
+from scan2sim.pipeline.core.errors import DamagedError, ScanError, WorkerError
 
 Executor = Callable[[list[PlannedTask], Store], Outcome]
 """Runs the tasks of a plan that have no cached results."""
@@ -154,6 +155,7 @@ def run_on_worker(
     cores: int | None,
     wanted: Mapping[str, str],
     channel: Channel | None = None,
+    disk: SharedDisk | None = None,
 ) -> Manifest:
     """Run one task on a worker, for a flow in another process or on another machine.
 
@@ -164,14 +166,23 @@ def run_on_worker(
         cores: CPU cores that the step may use; None: all.
         wanted: the flow's `versions()`.
         channel: where to publish the progress of the flow's run; None: nowhere.
+        disk: the flow's disk, for a worker that may be on another machine.
 
     Raises:
-        UnavailableError: this worker has other versions, or libraries are missing.
-        ScanError: as `run_task`.
+        WorkerError: this worker has other versions, or doesn't see the flow's disk.
+        UnavailableError: system libraries are missing.
+        ScanError: as `run_task`; names the machine if it isn't the flow's.
     """
-    check_version(item, wanted)
-    system_libs.check()
-    limit_cores(cores)
-    os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # set by Dask for long-lived processes; it slows steps down
-    with reserve_memory(memory, expected_memory(item, store)), published_step(channel, item, store) as on_event:
-        return run_in_subprocess(item, store, on_event)
+    try:
+        if disk is not None:
+            disk.check(store)
+        check_version(item, wanted)
+        system_libs.check()
+        limit_cores(cores)
+        os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)  # set by Dask for long-lived processes; it slows steps down
+        with reserve_memory(memory, expected_memory(item, store)), published_step(channel, item, store) as on_event:
+            return run_in_subprocess(item, store, on_event)
+    except ScanError as error:
+        if disk is not None and not isinstance(error, WorkerError):  # these name the machine
+            disk.name_worker(error)
+        raise

@@ -73,7 +73,7 @@ class PlannedTask:
         contents = dict(self.keys)
         for name, source in self.task.inputs.items():
             if isinstance(source, Output):
-                manifest = self._found(store.find(source.task.full_name, self._key(name)), source)
+                manifest = self._result(name, source, store, store.find)
                 contents[name] = f"{manifest.content_of(source.name)}/{source.name}"
         return key_of(self.task.step, self.task.params, contents)
 
@@ -92,14 +92,15 @@ class PlannedTask:
 
         Raises:
             DamagedError: a result that it reads is missing.
+            InputError: a source in object storage has changed since the task was planned.
         """
         paths = {}
         for name, source in self.task.inputs.items():
             if isinstance(source, Output):
-                manifest = self._found(store.read(source.task.full_name, self._key(name)), source)
+                manifest = self._result(name, source, store, store.read)
                 paths[name] = store.folder(source.task.full_name, self._key(name)) / manifest.files[source.name]
             else:
-                paths[name] = store.source(source)
+                paths[name] = store.source(source, self.keys[name])
         return paths
 
     def check(self, store: Store) -> None:
@@ -115,7 +116,13 @@ class PlannedTask:
     def _key(self, name: str) -> str:
         return self.keys[name].split("/")[0]
 
-    def _found(self, manifest: Manifest | None, source: Output) -> Manifest:
+    def _result(self, name: str, source: Output, store: Store, find: Callable[[str, str], Manifest | None]) -> Manifest:
+        """The result that an input comes from, which another machine may just have written."""
+        task, key = source.task.full_name, self._key(name)
+        manifest = find(task, key)
+        if manifest is None:
+            store.revalidate(task, key)
+            manifest = find(task, key)
         if manifest is None:
             raise DamagedError(source.task.full_name, "its result was deleted during the run")
         return manifest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -9,11 +10,14 @@ from typing import Literal
 from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.pipelines.graph import Task, TaskId
 from scan2sim.pipeline.core.cache import Manifest, Store
-from scan2sim.pipeline.core.errors import DamagedError, ScanError
+from scan2sim.pipeline.core.errors import DamagedError, ScanError, StepError
 
 Event = Literal["start", "progress", "done", "cached", "failed", "again"]
 EventCallback = Callable[[Task, Event, float, str], None]
 """Receives what happens to a task: task, event, fraction done, message."""
+
+MAX_REBUILDS = 3
+"""Number of times that one damaged result is rebuilt in a run."""
 
 
 def ignore_event(task: Task, event: Event, fraction: float, message: str) -> None:
@@ -62,6 +66,7 @@ class ReadyQueue:
         self._waiting = dict(self._planned)
         self._missing: set[TaskId] = set()  # known to have no cached result
         self._lost: set[TaskId] = set()  # failed, or depending on a failed task
+        self._rebuilds: Counter[TaskId] = Counter()
 
     def __bool__(self) -> bool:
         return bool(self._waiting)
@@ -99,13 +104,24 @@ class ReadyQueue:
         self._watch(item.task, "done", 1.0, "")
 
     def rebuild_damaged(self, item: PlannedTask, error: DamagedError) -> None:
-        """Record that a task found a damaged input: the input is rebuilt, and the task waits for it."""
-        self._waiting[item.task.id] = item
+        """Record that a task found a damaged input: the input is rebuilt, and the task waits for it.
+
+        A machine that finds every rebuilt result damaged (a failing disk or memory) must not keep the others busy: the
+        task fails after `MAX_REBUILDS`.
+        """
         damaged = self._by_name[error.where]
-        if self.done.pop(damaged, None) is not None:
+        if damaged in self.done:
+            if self._rebuilds[damaged] == MAX_REBUILDS:
+                cause = f"{damaged}, which it reads, is damaged after each of {MAX_REBUILDS} rebuilds: {error.cause}"
+                remedy = "Check the disk and the memory of the machine that reads it, then run again"
+                self.fail(item, StepError(item.task.full_name, cause, remedy))
+                return
+            self._rebuilds[damaged] += 1
+            del self.done[damaged]
             self._store.discard(damaged.full_name, self._planned[damaged].key)
             self._missing.add(damaged)
             self._waiting[damaged] = self._planned[damaged]
+        self._waiting[item.task.id] = item
         self._watch(item.task, "again", 0.0, f"the cached result of {damaged} is damaged: rebuilding it")
 
     def fail(self, item: PlannedTask, error: ScanError) -> None:

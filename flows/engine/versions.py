@@ -13,7 +13,7 @@ from functools import cache
 from scan2sim import __version__
 from scan2sim.flows.engine.planning import PlannedTask
 from scan2sim.flows.pipelines.steps import STEPS
-from scan2sim.pipeline.core.errors import UnavailableError
+from scan2sim.pipeline.core.errors import WorkerError
 
 EXTRAS_WITHOUT_STEPS = ("flows", "ray", "s3", "bus", "broker", "orchestration", "toolboxes", "teleop", "can", "dev")
 """Extras for scheduling, transfer, monitoring, services and tests: no step depends on their packages."""
@@ -41,7 +41,7 @@ def check_version(item: PlannedTask, wanted: Mapping[str, str]) -> None:
         wanted: the flow's `versions()`; packages missing here are left to the steps, which report them.
 
     Raises:
-        UnavailableError: this machine has another version of the project, of the step, or of a package.
+        WorkerError: this machine has another version of the project, of the step, or of a package.
     """
     mine, name = versions(), item.task.step.name
     others = [f"{k} {mine[k]} instead of {v}" for k, v in wanted.items() if mine.get(k, v) != v]
@@ -50,4 +50,4 @@ def check_version(item: PlannedTask, wanted: Mapping[str, str]) -> None:
         others.append(f"version {local} of step {name} instead of {item.task.step.version}")
     if others:
         remedy = "Install the versions of the flow's machine on all workers, and restart them"
-        raise UnavailableError(platform.node(), f"this worker has {', '.join(others)}", remedy)
+        raise WorkerError(platform.node(), f"this worker has {', '.join(others)}", remedy)

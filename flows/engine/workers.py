@@ -12,6 +12,7 @@ import re
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from scan2sim.pipeline.core.errors import SettingError, UnavailableError
@@ -19,22 +20,45 @@ from scan2sim.pipeline.core.optional_deps import require
 
 Call = Callable[..., Any]
 """Calls a function on a worker, waits, and returns its result or raises its exception."""
+NO_WORKERS = "the {what} at {address} has no workers: steps wait until one connects (`{command}`)"
+STEPS_OF_EMPTY_CLUSTER = 64
+"""Number of steps for a cluster without workers yet: one that grows on demand must see a demand."""
 
 
-def workers(name: str, count: int, address: str | None = None) -> AbstractContextManager[Call]:
+@dataclass(frozen=True)
+class Workers:
+    """Workers that are ready.
+
+    Attributes:
+        call: calls a function on one of them.
+        count: number of functions that they run at the same time.
+    """
+
+    call: Call
+    count: int
+
+
+def ignore_warning(text: str) -> None:
+    """A callback for warnings that does nothing."""
+
+
+def workers(
+    name: str, count: int, address: str | None = None, warn: Callable[[str], None] = ignore_warning
+) -> AbstractContextManager[Workers]:  # fmt: skip
     """Workers that run one function at a time each; if a worker dies, another one repeats its function.
 
     Args:
         name: "threads", "dask" or "ray".
-        count: number of workers to start here.
+        count: number of workers to start here, or to use at the address; 0: all that are there.
         address: of a Dask scheduler or a Ray cluster whose workers to use instead.
+        warn: receives a warning if there are no workers at the address, for which every step waits.
 
     Raises:
         UnavailableError: when the context is entered, nothing answers at the address.
         ScanError: as `check`.
     """
     check(name)
-    return {"threads": _threads, "dask": _dask, "ray": _ray}[name](count, address)
+    return {"threads": _threads, "dask": _dask, "ray": _ray}[name](count, address, warn)
 
 
 def check(name: str) -> None:
@@ -51,12 +75,12 @@ def check(name: str) -> None:
 
 
 @contextmanager
-def _threads(count: int, address: str | None) -> Iterator[Call]:
-    yield lambda function, *arguments: function(*arguments)
+def _threads(count: int, address: str | None, warn: Callable[[str], None]) -> Iterator[Workers]:
+    yield Workers(lambda function, *arguments: function(*arguments), count or 1)
 
 
 @contextmanager
-def _dask(count: int, address: str | None) -> Iterator[Call]:
+def _dask(count: int, address: str | None, warn: Callable[[str], None]) -> Iterator[Workers]:
     import dask
     from distributed import Client
 
@@ -70,11 +94,16 @@ def _dask(count: int, address: str | None) -> Iterator[Call]:
     except OSError as error:
         raise _unreachable(address, "Dask scheduler", error) from error
     with client:
-        yield lambda function, *arguments: client.submit(function, *arguments, pure=False).result()
+        if address:
+            there = sum(worker["nthreads"] for worker in client.scheduler_info()["workers"].values())
+            if there == 0:
+                warn(NO_WORKERS.format(what="Dask scheduler", address=address, command=f"dask worker {address}"))
+            count = count or there or STEPS_OF_EMPTY_CLUSTER
+        yield Workers(lambda function, *arguments: client.submit(function, *arguments, pure=False).result(), count)
 
 
 @contextmanager
-def _ray(count: int, address: str | None) -> Iterator[Call]:
+def _ray(count: int, address: str | None, warn: Callable[[str], None]) -> Iterator[Workers]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no telemetry
     import ray
 
@@ -94,7 +123,13 @@ def _ray(count: int, address: str | None) -> Iterator[Call]:
             raise error.cause from None
 
     try:
-        yield call
+        if address:
+            there = int(ray.cluster_resources().get("CPU", 0))  # type: ignore[no-untyped-call]
+            if there == 0:
+                command = f"ray start --address {address}"
+                warn(NO_WORKERS.format(what="Ray cluster", address=address, command=command))
+            count = count or there or STEPS_OF_EMPTY_CLUSTER
+        yield Workers(call, count)
     finally:
         ray.shutdown()
 

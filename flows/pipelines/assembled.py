@@ -12,7 +12,7 @@ from scan2sim.flows.pipelines.uncached import CHECKED, run_check
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.importers.clouds_and_photos import common_crs, import_las
 from scan2sim.pipeline.io.tile_folder import check_target
-from scan2sim.slam.steps.adjust_cloud import ADJUST_CLOUD, AdjustCloudParams
+from scan2sim.slam.steps.adjust_cloud import ADJUST_CLOUD, AdjustCloudParams, CloudCrs
 from scan2sim.slam.trajectory.strip_adjustment import PoseSource
 
 
@@ -28,10 +28,12 @@ def check(
     Raises:
         ScanError: a cloud can't be read, or has no CRS.
     """
-    _, unit = common_crs(clouds, crs, units)
+    known, unit = common_crs(clouds, crs, units)
     inputs: dict[str, Any] = {f"cloud.{i}": cloud for i, cloud in enumerate(clouds)}
     return Task(
-        ADJUST_CLOUD, AdjustCloudParams(pose_source=pose_source, unit=unit), inputs | {"trajectory": trajectory}
+        ADJUST_CLOUD,
+        AdjustCloudParams(pose_source=pose_source, unit=unit, context=CloudCrs(crs=known)),
+        inputs | {"trajectory": trajectory},
     )
 
 

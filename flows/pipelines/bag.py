@@ -17,7 +17,7 @@ from scan2sim.pipeline.importers.bag.reader import opened
 from scan2sim.pipeline.importers.sweeps import PhotoPlacementParams, SelectionParams
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.steps.import_sweeps import SweepsParams
-from scan2sim.pipeline.steps.read_bag import READ_BAG
+from scan2sim.pipeline.steps.read_bag import READ_BAG, Planned, ReadBagParams
 from scan2sim.slam.steps.strip_adjustment import PoseSourceParams
 
 
@@ -67,7 +67,8 @@ def build_graph(source: BagSource, here: Path) -> list[Task]:
     crs = source.crs if source.crs != crs_io.LOCAL else utm or crs_io.LOCAL
     photos_as = {name: getattr(source, name) for name in PhotoPlacementParams.model_fields}
     placing = SweepsParams(**dict(source.selection(plan)) | photos_as | {"crs": crs, "scanner_poses": True})
-    tasks = [Task(READ_BAG, resolved(params, plan), {"bag": path, **beside})]
+    chosen = ReadBagParams(**dict(resolved(params, plan)), context=Planned(warnings=plan.warnings))
+    tasks = [Task(READ_BAG, chosen, {"bag": path, **beside})]
     read = tasks[0].id
     files = {"sweeps": Output(read, "sweeps")}
     poses = None if plan.poses.kind == "sweeps" else Output(read, "poses")

@@ -8,14 +8,15 @@ from typing import Any
 from pydantic import Field
 
 from scan2sim.flows.pipelines.graph import Output, Task, TaskId, folder_inputs
-from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.step import Params, Step
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io.geodata import crs as crs_io
+from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.steps.import_photos import IMPORT_PHOTOS, ImportPhotosContext, ImportPhotosParams
 from scan2sim.slam.reconstruction import colmap
-from scan2sim.slam.reconstruction.photos import check_count, list_photos
+from scan2sim.slam.reconstruction.photos import check_count, list_photos, no_photos
 from scan2sim.slam.reconstruction.positions import check_sources
 from scan2sim.slam.steps.dense_stereo import DENSE_STEREO, DenseStereoParams
 from scan2sim.slam.steps.place_photos import PLACE_PHOTOS, PlaceContext, Placed, PlaceParams
@@ -68,7 +69,8 @@ def build_graph(source: Images, here: Path) -> list[Task]:
     if not is_video:
         names = list_photos(photos)
         if not names:
-            raise InputError(photos, "contains no photos", "Give a folder of photos, or a video file")
+            raise no_photos(photos)
+        image.check_decoders(photos / name for name in names)
         check_count(photos, names)
     given = {name: getattr(source, name) for name in ("gps", "positions", "times", "cloud")}
     files: dict[str, Path] = {name: here / path for name, path in given.items() if path is not None}

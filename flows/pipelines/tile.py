@@ -550,7 +550,7 @@ def _texture(
     furniture: Sources = {"cloud.furniture": output(SPLIT, "furniture")} if parts.furniture else {}
     points = parts.clouds | furniture | _synthesized_inputs(synthesized)
     if graph.tile.robot_map is not None:  # points finer than the voxels show lane markings
-        points |= {"raw.terrain": output(SPLIT, "terrain")}
+        points |= {"raw.terrain": output(SPLIT, "terrain"), "colour_source": output(MAP_COLOURS, "source")}
     cameras: Sources = {"views": photos["cameras"]}
     seen: Sources = cameras | {name: photos[name] for name in ("depth", "photo_consistency")}
     corrected = {name: photos[name] for name in ("views", "depth", "exposures", "photo_consistency")}

@@ -17,6 +17,7 @@ A manifest holds a digest of itself; one that doesn't match it, or that names fi
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -273,10 +274,36 @@ class Store:
             self.remote.remove(f"{task}/{key}/manifest.json")
         shutil.rmtree(self.folder(task, key), ignore_errors=True)
 
-    def source(self, path: Path) -> Path:
-        """A source file, fetched from `sources` if it isn't on this machine."""
-        if self.sources is not None and not path.exists() and path.is_relative_to(self.sources.local):
-            self.sources.pull([path.relative_to(self.sources.local).as_posix()])
+    def revalidate(self, task: str = "", key: str = "") -> None:
+        """Let a network drive show what other machines have written below the root, or as a result.
+
+        NFS caches for up to a minute that a file is absent; opening a folder compares it with the server's.
+        """
+        folder = self.root
+        for name in ("", *task.split("/"), key):
+            folder = folder / name
+            with suppress(OSError):
+                os.scandir(folder).close()
+
+    def source(self, path: Path, expected: str | None = None) -> Path:
+        """A source file, fetched from `sources` if it isn't on this machine, or if its copy here is an older one.
+
+        Args:
+            path: the file, below the local folder of `sources`; others are left as they are.
+            expected: its SHA-256 when the run was planned; None: any.
+
+        Raises:
+            InputError: it has changed in the storage since then.
+        """
+        if self.sources is None or path.is_dir() or not path.is_relative_to(self.sources.local):
+            return path
+        if not path.exists() or (expected is not None and digest(path) != expected):
+            name = path.relative_to(self.sources.local).as_posix()
+            self.sources.pull([name])
+            if expected is not None and digest(path) != expected:
+                raise InputError(
+                    f"{self.sources.url}/{name}", "has changed during the run", "Run again once all files are uploaded"
+                )
         return path
 
     def _manifest(self, task: str, key: str) -> Manifest | None:
@@ -385,16 +412,37 @@ class Store:
             body = asdict(manifest)
             text = json.dumps(body | {"seal": _seal(body)}, indent=1)
             (folder / "manifest.json").write_text(text, encoding="utf-8")
-            target = self.folder(manifest.label, key)
-            if target.is_symlink():
-                target.unlink()
-            elif target.exists():
-                shutil.rmtree(target)
-            folder.replace(target)
+            if not self._has_same(manifest, key):
+                self._move(folder, self.folder(manifest.label, key))
         except OSError as error:
             raise from_os_error(error, self.root) from None
         if self.remote is not None:  # the manifest last: it makes the result valid
             self.remote.push(f"{manifest.label}/{key}/{name}" for name in (*manifest.sizes, "manifest.json"))
+
+    def _has_same(self, manifest: Manifest, key: str) -> bool:
+        """Whether an intact result with the same files is in place: of a worker that had lost its network, say.
+
+        Readers on other machines may have its files open, so it stays.
+        """
+        folder = self.folder(manifest.label, key)
+        if self.remote is not None or manifest.failed or folder.is_symlink():
+            return False
+        found = self.find(manifest.label, key)
+        return not (found is None or found.failed or found.content != manifest.content or damaged(folder, found))
+
+    def _move(self, folder: Path, target: Path) -> None:
+        """Move a finished folder into place; an older one there, also one that appears meanwhile, is removed."""
+        while True:
+            try:
+                folder.replace(target)
+                return
+            except OSError as error:
+                if error.errno not in (errno.EEXIST, errno.ENOTEMPTY) and not os.path.lexists(target):
+                    raise
+            aside = new_folder(target.parent, TEMPORARY_PREFIX)
+            with suppress(FileNotFoundError):
+                target.replace(aside / "replaced")
+            shutil.rmtree(aside, ignore_errors=True)  # NFS keeps open files; `sweep` removes what is left
 
     def sweep(self, used: Mapping[str, str]) -> None:
         """Remove all results that `used` (task to key) does not name, and what killed runs left behind."""

@@ -84,6 +84,10 @@ class UnavailableError(ScanError):
     """A package, program or device that is missing, or doesn't run on this machine."""
 
 
+class WorkerError(UnavailableError):
+    """A worker of a cluster that can't run the steps of a run: it has other versions, or another disk."""
+
+
 # exception: (exit code, HTTP status, meaning)
 EXIT_CODES: dict[type[BaseException], tuple[int, int, str]] = {
     SettingError: (2, 422, "a setting or option is wrong"),

@@ -17,6 +17,7 @@ EXTRA_OF = {
     "kiss_icp": "lidar",
     "pymeshlab": "meshlab",
     "pye57": "e57",
+    "pillow_heif": "heif",
     "zstandard": "ept",
     "prefect": "flows",
     "distributed": "flows",

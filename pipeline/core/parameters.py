@@ -55,8 +55,22 @@ Device = Annotated[
 """Compute device: "numba" only in the step `texture`, the others are names of torch and onnxruntime devices."""
 MAX_NAME = 100
 NAME = rf"^[A-Za-z0-9_]{{1,{MAX_NAME}}}$"
-"""Names of tiles and surveys, which become names of folders, files and SDF elements."""
 Name = Annotated[str, Field(pattern=NAME)]
+
+
+def is_reserved(name: str) -> bool:
+    """Whether simulators can't have a model of this name: `world` is the root of SDF, MJCF and the exported URDF."""
+    return name == "world" or (name.startswith("__") and name.endswith("__"))
+
+
+def _not_reserved(name: str) -> str:
+    if is_reserved(name):
+        raise ValueError(f"{name!r} is reserved by simulators (SDF, MuJoCo); choose another name")
+    return name
+
+
+WorldName = Annotated[Name, AfterValidator(_not_reserved)]
+"""Names of tiles and surveys, which become names of folders, files, and models of simulators."""
 
 
 def _no_nul(text: Any) -> Any:

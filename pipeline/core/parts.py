@@ -83,13 +83,17 @@ NO_PARTS = Parts()
 
 def _linked(part: Path, out: Path) -> bool:
     """Link the files of a part into `out`, if they are as they were written."""
+    linked: list[Path] = []
     try:
         listed: dict[str, str] = json.loads((part / LISTED).read_text(encoding="utf-8"))
         if any(file_digest(part / name) != expected for name, expected in listed.items()):
             return False
         for name in listed:
             (out / name).parent.mkdir(parents=True, exist_ok=True)
+            linked.append(out / name)
             os.link(part / name, out / name)
     except (OSError, ValueError, AttributeError):
+        for path in linked:  # what is written there would change other results, too
+            path.unlink(missing_ok=True)
         return False
     return True

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scan2sim.pipeline.core.errors import InputError, UnavailableError
+from scan2sim.pipeline.core.errors import InputError, ScanError, UnavailableError, from_os_error
 from scan2sim.pipeline.core.paths import inside
 from scan2sim.pipeline.core.step import Report, silent
 
 PULLED_INDEX, PUSHED_INDEX = ".remote.json", ".pushed.json"
+INDEX_INTERVAL_S = 60.0
+"""Seconds after which an index is written again, so that a killed transfer continues."""
 CACHE_VARIABLE = "SCAN2SIM_CACHE"
 """Environment variable: the cache folder; default: `~/.cache/scan2sim`. The same on all machines of a cluster."""
 
@@ -67,13 +71,17 @@ class Remote:
 
         Raises:
             InputError: a name points outside of the folder.
+            SpaceError: the disk of the local copy is full, or can't be written.
             UnavailableError: the storage can't be reached or read.
         """
         files, root = self._open()
         for name in names:
             target = self._path(name)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(prefix=".fetch-", dir=target.parent)
+            try:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                handle, temporary = tempfile.mkstemp(prefix=".fetch-", dir=target.parent)
+            except OSError as error:
+                raise from_os_error(error, target) from None
             os.close(handle)
             try:
                 files.get_file(f"{root}/{name}", temporary)
@@ -97,22 +105,29 @@ class Remote:
         index = self.local / PULLED_INDEX
         try:
             files.invalidate_cache()
-            found = {path[len(root) + 1 :]: str(files.ukey(path)) for path in files.find(root)}
+            # consoles and other programs mark folders by empty objects whose keys end with a slash
+            paths = [path for path in files.find(root) if len(path) > len(root) and not path.endswith("/")]
+            found = {path[len(root) + 1 :]: str(files.ukey(path)) for path in paths}
         except Exception as error:
             raise self._unreachable(error) from error
         if not found:
             raise InputError(self.url, "is empty", "Check the address; `scan2sim tile --copy` creates a survey")
         for name in found:
             self._path(name)
-        known: dict[str, str] = json.loads(index.read_text(encoding="utf-8")) if index.is_file() else {}
+        known = _read_index(index)
+        removed = known.keys() - found.keys()
         new = [name for name, key in found.items() if known.get(name) != key or not (self.local / name).is_file()]
+        saved = time.monotonic()
         for i, name in enumerate(new):
             report(i / len(new), name)
             self.pull([name])
-        for name in known.keys() - found.keys():
+            known[name] = found[name]
+            if time.monotonic() - saved > INDEX_INTERVAL_S:
+                _write_index(index, known)
+                saved = time.monotonic()
+        for name in removed:
             self._path(name).unlink(missing_ok=True)
-        self.local.mkdir(parents=True, exist_ok=True)
-        index.write_text(json.dumps(found), encoding="utf-8")
+        _write_index(index, found)
         return self.local
 
     def push(self, names: Iterable[str]) -> None:
@@ -149,13 +164,19 @@ class Remote:
             UnavailableError: as `push`.
         """
         index = self.local / PUSHED_INDEX
-        known: dict[str, list[int]] = json.loads(index.read_text(encoding="utf-8")) if index.is_file() else {}
-        stamps = {}
+        known = _read_index(index)
+        stamps: dict[str, list[int]] = {}
         for name in names:
             stat = (self.local / name).stat()
             stamps[name] = [stat.st_size, stat.st_mtime_ns]
-        self.push(name for name, stamp in stamps.items() if known.get(name) != stamp)
-        index.write_text(json.dumps(stamps), encoding="utf-8")
+        saved = time.monotonic()
+        for name in [name for name, stamp in stamps.items() if known.get(name) != stamp]:
+            self.push([name])
+            known[name] = stamps[name]
+            if time.monotonic() - saved > INDEX_INTERVAL_S:
+                _write_index(index, known)
+                saved = time.monotonic()
+        _write_index(index, stamps)
 
     def _path(self, name: str) -> Path:
         """Local path of a key."""
@@ -177,6 +198,28 @@ class Remote:
             raise UnavailableError(self.url, str(error), remedy) from None
         return files, root.rstrip("/")
 
-    def _unreachable(self, error: Exception) -> UnavailableError:
+    def _unreachable(self, error: Exception) -> ScanError:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return from_os_error(error, self.local)  # this machine's disk
         cause = f"can't be reached ({type(error).__name__}: {error})"
-        return UnavailableError(self.url, cause, "Check the address, the credentials and the network")
+        remedy = "Check the address, the credentials (they must permit listing the folder, too) and the network"
+        return UnavailableError(self.url, cause, remedy)
+
+
+def _read_index(path: Path) -> dict[str, Any]:
+    """What was transferred before, by name; empty, so that all is transferred again, if the file can't be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _write_index(path: Path, index: Mapping[str, Any]) -> None:
+    temporary = path.with_suffix(".tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(json.dumps(index), encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise from_os_error(error, path) from None

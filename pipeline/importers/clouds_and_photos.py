@@ -35,10 +35,11 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F64, Camera, CameraModel, Frame, PointCloud, Trajectory
+from scan2sim.pipeline.importers import foreign_tables
 from scan2sim.pipeline.importers.path_correction import PathCorrection, read_correction, write_corrected
 from scan2sim.pipeline.importers.photo_fit import fitted_cameras
 from scan2sim.pipeline.io import clouds as cloud_io
-from scan2sim.pipeline.io import tables
+from scan2sim.pipeline.io import sbet, tables
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io import trajectory_check as check_io
 from scan2sim.pipeline.io.clouds import las
@@ -62,6 +63,7 @@ ALIASES = {
     "camera": ("kamera",),
 }
 """Column names of other programs and languages."""
+FULL_CIRCLE_DEG = 360.0
 MATRIX_COLUMNS = tuple(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 ANGLE_COLUMNS = ("omega", "phi", "kappa")
@@ -262,16 +264,16 @@ def _corrected_path(
     trajectory: Path | None, check: Path | None, frame: Frame
 ) -> tuple[Trajectory | None, PathCorrection | None]:
     """The trajectory (metres), if it differs from its file: in the clouds' clock, corrected; and its correction."""
-    if trajectory is None or check is None:
+    if trajectory is None or (check is None and not sbet.is_sbet(trajectory)):
         return None, None
-    found = check_io.read(check) or {}
+    found = (None if check is None else check_io.read(check)) or {}
     offset = float(found.get("clock_offset_s", 0.0))
     path = trajectory_io.read(trajectory, frame, ordered=False, timed=True)
     path = replace(path, times=path.times + offset)
-    correction = read_correction(check, path)
+    correction = None if check is None else read_correction(check, path)
     if correction is not None:
         return correction.trajectory(), correction
-    return (path if offset else None), None
+    return (path if offset or sbet.is_sbet(trajectory) else None), None
 
 
 def _add_trajectory(trajectory: Path, path: Trajectory | None, folder: Path, frame: Frame, link: bool) -> str:
@@ -365,6 +367,7 @@ def read_photos(
     Raises:
         InputError: names the CSV, the row and the column.
     """
+    foreign_tables.check(photos)
     given = {}
     if cameras:
         given = {row["camera"]: row for _, row in _rows(cameras, ("camera", *CAMERA_COLUMNS), ("camera",), warn)}
@@ -483,4 +486,7 @@ def _rotation(row: Row, path: Path, where: str) -> F64:
         if abs(np.linalg.norm(values) - 1) > 1e-3:
             raise InputError(path, f"{where}: the quaternion is not normalized", "Give a unit quaternion, qw first")
         return Rotation.from_quat(np.roll(values, -1)).as_matrix()
+    if np.abs(values).max() > FULL_CIRCLE_DEG:
+        cause = f"{where}: an angle of {np.abs(values).max():g} is more than a full circle in degrees"
+        raise InputError(path, cause, "Convert omega, phi and kappa to degrees; gon (BINGO): times 0.9")
     return Rotation.from_euler("XYZ", values, degrees=True).as_matrix() @ np.diag([1.0, -1.0, -1.0])

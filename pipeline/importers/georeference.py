@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,10 +20,15 @@ from scan2sim.pipeline.geometry.similarity import Similarity, fit_robust
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.images import exif
 
+if TYPE_CHECKING:
+    from pyproj import CRS
+
 MAX_GPS_RESIDUAL_M = 15.0
 """Distance between a photo's GPS position and its position in the model above which the GPS is an outlier."""
 MAX_ANGLE_SIGMA_RAD = np.radians(3.0)
 """Standard deviation of an angle above which the GPS track doesn't determine it."""
+
+WGS84 = "EPSG:4326"
 
 
 @dataclass(frozen=True)
@@ -45,20 +50,25 @@ class Fit:
     notes: tuple[str, ...]
 
 
-def from_geocentric(model: Path, T_earth: F64, centres: F64, crs: str | None) -> Fit:
+def from_geocentric(model: Path, T_earth: F64, centres: F64, crs: str | None, datum: str | None = None) -> Fit:
     """Georeference by a similarity (4, 4) to geocentric coordinates; exact at the mean of the camera centres (P, 3).
+
+    Args:
+        model: the model's file, for messages.
+        T_earth: similarity from the model to geocentric coordinates, metres.
+        centres: camera centres, model coordinates.
+        crs: projected CRS; None: UTM.
+        datum: geographic CRS of the geocentric coordinates, in degrees from Greenwich; None: WGS 84.
 
     Raises:
         InputError: the CRS is not projected, or the model is outside of its area.
     """
-    from pyproj import Transformer
-
     middle = centres.mean(axis=0)
     model_scale = float(np.cbrt(np.linalg.det(T_earth[:3, :3])))
     corners = middle + np.vstack([np.zeros(3), 100 / model_scale * np.eye(3)])  # 100 m along each of the model's axes
     xyz = corners @ T_earth[:3, :3].T + T_earth[:3, 3]
-    lon, lat, height = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True).transform(*xyz.T)
-    crs, projected, _ = _projected(model, crs, np.column_stack([lat, lon, height]))
+    geographic = _geographic(xyz, datum)
+    crs, projected, _ = _projected(model, crs, geographic, datum or WGS84)
     u, stretch, vt = np.linalg.svd((projected[1:] - projected[0]).T * model_scale / 100)
     scale = float(np.sort(stretch)[1])  # two of the three are those of the projection, one is that of the height
     rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
@@ -68,8 +78,40 @@ def from_geocentric(model: Path, T_earth: F64, centres: F64, crs: str | None) ->
             f"heights are above the ellipsoid, but {crs_io.name(crs)} defines another height system: if they are off "
             "by tens of metres, export model and cloud with ellipsoidal heights"
         )
+    if datum is not None and not _same_ellipsoid(datum, crs):
+        notes.append(f"heights stay those of {crs_io.name(datum)}, whose ellipsoid is not that of {crs_io.name(crs)}")
     onto = Similarity(scale, rotation, projected[0] - scale * rotation @ middle)
     return Fit(onto, crs, None, list(range(len(centres))), tuple(notes))
+
+
+def _geographic(xyz: F64, datum: str | None) -> F64:
+    """Latitudes, longitudes (degrees) and heights (N, 3) of geocentric positions on the ellipsoid of a datum."""
+    from pyproj import Transformer
+
+    if datum is None:
+        to_degrees = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
+    else:
+        ellipsoid = _own_datum(datum).ellipsoid
+        assert ellipsoid is not None
+        axes = f"+a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r}"
+        degrees = "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
+        to_degrees = Transformer.from_pipeline(f"+proj=pipeline +step +inv +proj=cart {axes} {degrees}")
+    x, y, z = xyz.T
+    lon, lat, height = to_degrees.transform(x, y, z)
+    return np.column_stack([lat, lon, height])
+
+
+def _same_ellipsoid(first: str, second: str) -> bool:
+    a, b = (_own_datum(crs).ellipsoid for crs in (first, second))
+    return a is not None and b is not None and abs(a.semi_major_metre - b.semi_major_metre) < 1e-3
+
+
+def _own_datum(crs: str) -> CRS:
+    """A CRS without the shift to WGS 84 that its WKT may have (TOWGS84)."""
+    from pyproj import CRS
+
+    parsed = CRS.from_user_input(crs)
+    return parsed.source_crs if parsed.is_bound and parsed.source_crs is not None else parsed
 
 
 def from_photo_gps(model: Path, centres: F64, ups: F64, photos: Sequence[Path], crs: str | None) -> Fit:
@@ -178,8 +220,11 @@ def from_positions(
     return Fit(Similarity(onto.scale / unit, onto.rotation, onto.translation / unit), crs, rms, used, tuple(notes))
 
 
-def _projected(model: Path, crs: str | None, geographic: F64) -> tuple[str, F64, float]:
-    """Project (N, 3) latitudes, longitudes, heights (m); returns CRS (default: UTM), coordinates, metres per unit."""
+def _projected(model: Path, crs: str | None, geographic: F64, source: str = WGS84) -> tuple[str, F64, float]:
+    """Project (N, 3) latitudes, longitudes, heights (m); returns CRS (default: UTM), coordinates, metres per unit.
+
+    `source` is their geographic CRS.
+    """
     from pyproj import Transformer
 
     lat, lon, height = geographic.T
@@ -187,7 +232,8 @@ def _projected(model: Path, crs: str | None, geographic: F64) -> tuple[str, F64,
     if crs == crs_io.LOCAL:
         raise InputError(model, "is georeferenced, so the CRS can't be local", "Give a projected CRS")
     _, unit = crs_io.common(model, crs, None, (), ())
-    east, north = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(lon, lat)
+    target = crs if source == WGS84 else _own_datum(crs)
+    east, north = Transformer.from_crs(source, target, always_xy=True).transform(lon, lat)
     out = np.column_stack([east, north, height / unit])
     if not np.isfinite(out).all():
         raise InputError(model, f"is outside of the area of {crs_io.name(crs)}", "Give another CRS")

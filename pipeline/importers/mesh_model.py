@@ -22,6 +22,7 @@ from scan2sim.pipeline.importers.robot_map import (
     AXES,
     MIN_TILT_DEG,
     MapParams,
+    check_height,
     level_rotation,
     unit_of,
     write_map,
@@ -81,7 +82,7 @@ def import_mesh(
     source, notes = read(path)
     for note in notes:
         warn(note)
-    is_gltf = path.suffix.lower() in (".glb", ".gltf")
+    is_gltf, guessed = path.suffix.lower() in (".glb", ".gltf"), params.units == "auto"
     if is_gltf and params.units == "auto":
         params = params.model_copy(update={"units": "m"})
     some = surface_points(source.mesh).xyz
@@ -103,6 +104,8 @@ def import_mesh(
     report(0.6, "colours")
     rgb = _colours(source, face, weights, warn)
     cloud = PointCloud(frame, points @ R.T.astype(np.float32), rgb)
+    if guessed:
+        check_height(cloud.xyz, warn)
     report(0.7, "description")
     found = describe(cloud.xyz, -np.asarray(frame.origin))
     scene = found.scene if params.scene == "auto" else params.scene

@@ -152,7 +152,8 @@ def _model_to_tile(
     if found.T_earth is not None:
         if gps or up is not None or scale != 1.0:
             raise SettingError("gps, up, scale", f"{model} is already georeferenced", "Leave these options out")
-        fit = georeference.from_geocentric(model, found.T_earth, found.centres, crs or cloud_crs or found.crs)
+        target = crs or cloud_crs or found.crs
+        fit = georeference.from_geocentric(model, found.T_earth, found.centres, target, found.datum)
         for line in fit.notes:
             warn(f"{model}: {line}")
         return fit.onto, fit.crs

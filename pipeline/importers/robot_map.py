@@ -46,6 +46,8 @@ MAX_SLOPE_DEG = 8.0
 """Without walls, a ground that is tilted less may be a sloping road: coordinates are kept."""
 MIN_WIDTH_M = 0.1
 """Standard deviation of the points along their second axis below which they are no surface."""
+USUAL_HEIGHT_M = 100.0
+"""Height of a map or mesh above which its assumed unit is doubted: centimetres look like that."""
 FAR_ORIGIN_M = 10_000.0
 """Coordinates above this need an origin of their own to fit into float32."""
 AXES: dict[str, tuple[int, int, int]] = {
@@ -139,6 +141,8 @@ def import_map(
     if not np.array_equal(R, np.eye(3)):
         cloud = replace(cloud, xyz=(cloud.xyz @ R.T.astype(np.float32)), normal=None)
         cloud = replace(cloud, frame=Frame(origin=tuple((R @ origin).tolist())))
+    if crs is None and params.units == "auto":
+        check_height(cloud.xyz, warn)
     report(0.7, "description")
     found = describe(cloud.xyz, -np.asarray(cloud.frame.origin))
     scene = found.scene if params.scene == "auto" else params.scene
@@ -203,6 +207,13 @@ def unit_of(xyz: F32, spacing: float, params: MapParams, warn: Callable[[str], N
     if name != "m":
         warn(f"coordinates are in {name}: converted to metres (--units)")
     return UNIT_M[name]
+
+
+def check_height(xyz: F32, warn: Callable[[str], None]) -> None:
+    """Warn if levelled points (N, 3), in metres by assumption, are so high that they may be in a smaller unit."""
+    height = float(np.ptp(np.percentile(xyz[:, 2], (1, 99))))
+    if height > USUAL_HEIGHT_M:
+        warn(f"it is {height:,.0f} m high: if it isn't, name the unit of its coordinates (--units cm, for example)")
 
 
 def _read(clouds: Sequence[Path], warn: Callable[[str], None]) -> tuple[PointCloud, str | None]:

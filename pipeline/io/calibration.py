@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from scan2sim.pipeline.camera import panorama
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io import file_checks, toml
-from scan2sim.pipeline.io.images.image import SUFFIXES, size_of
+from scan2sim.pipeline.io.images.image import SUFFIXES, read_levels, size_of
 from scan2sim.pipeline.io.sweep_files import list_files
 from scan2sim.pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry
 
@@ -133,7 +134,10 @@ def camera_of_photos(
     width, height = size_of(first)
     if file is not None:
         return read_camera(file, width, height)
-    if model == "equirectangular" or (model == "auto" and focal is None and width == 2 * height):
+    if model == "auto" and focal is None and width == 2 * height:
+        panorama.check(first, read_levels(first))
+        model = "equirectangular"
+    if model == "equirectangular":
         return Camera("equirectangular", width, height)
     if focal is None or not focal > 0:
         raise InputError(photos, "have no camera", "Give --focal (pixels), or a file with the camera")

@@ -50,8 +50,7 @@ def companions(path: Path) -> list[Path]:
             if file is not None:
                 names += _named(rb"^\s*map_Kd\s+(.+?)\s*$", _head(file, HEAD_BYTES))
     elif suffix == ".ply":
-        header = _head(path, 1 << 16).split(b"end_header")[0]
-        names += _named(rb"^comment TextureFile\s+(.+?)\s*$", header)
+        names += ply_textures(path)
     elif suffix == ".gltf":
         try:
             about = json.loads(path.read_text(encoding="utf-8"))
@@ -60,6 +59,12 @@ def companions(path: Path) -> list[Path]:
             return []  # reading the mesh reports it
     beside = {find_beside(path.parent, name) for name in names if not name.startswith("data:")}
     return sorted(file for file in beside if file is not None)
+
+
+def ply_textures(path: Path) -> list[str]:
+    """Names of the texture images in the header of a PLY, in the order in which its faces number them."""
+    header = _head(path, 1 << 16).split(b"end_header")[0]
+    return _named(rb"^comment TextureFile\s+(.+?)\s*$", header)
 
 
 def find_beside(folder: Path, name: str) -> Path | None:

@@ -18,9 +18,9 @@ from trimesh.resolvers import Resolver
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, F64, I64, U8, UNCOLOURED, Bools, Frame, Mesh
-from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io import file_checks, foreign_files, gltf_features
 from scan2sim.pipeline.io.images.image import MAX_PIXELS
-from scan2sim.pipeline.io.mesh_files import SUFFIXES, find_beside
+from scan2sim.pipeline.io.mesh_files import SUFFIXES, find_beside, ply_textures
 from scan2sim.pipeline.io.source_mesh import SourceMesh, encoded
 
 MAX_FACES = 20_000_000
@@ -100,7 +100,7 @@ def read(path: Path) -> tuple[SourceMesh, list[str]]:
     folder = _Folder(path.parent)
     notes: list[str] = []
     with _large_images():
-        parts = _merged(list(_parts(_load(path, folder), path)), path, notes)
+        parts = _merged(list(_parts(_load(path, folder), path, folder)), path, notes)
         if folder.missing:
             names = ", ".join(sorted(set(folder.missing)))
             notes.append(f"{names}: not found beside {path.name}, or damaged; it is left out, with its colours")
@@ -109,7 +109,9 @@ def read(path: Path) -> tuple[SourceMesh, list[str]]:
 
 def _load(path: Path, folder: _Folder) -> trimesh.Scene:
     if path.suffix.lower() not in SUFFIXES:
-        raise InputError(path, "is not a mesh that can be read", f"Use {', '.join(SUFFIXES)}")
+        raise foreign_files.unread(path, "is not a mesh that can be read", f"Use {', '.join(SUFFIXES)}")
+    if path.suffix.lower() in (".gltf", ".glb"):
+        gltf_features.check(path)
     try:
         with open(path, "rb") as file:
             return trimesh.load_scene(
@@ -142,9 +144,9 @@ def _large_images() -> Iterator[None]:
         Image.MAX_IMAGE_PIXELS = before
 
 
-def _parts(scene: trimesh.Scene, path: Path) -> Iterator[_Part]:
+def _parts(scene: trimesh.Scene, path: Path, folder: _Folder) -> Iterator[_Part]:
     """All meshes of a scene, in its axes."""
-    total = 0
+    total, textures = 0, ply_textures(path) if path.suffix.lower() == ".ply" else []
     for node in scene.graph.nodes_geometry:
         T, name = scene.graph[node]
         shape = scene.geometry[name]
@@ -162,7 +164,45 @@ def _parts(scene: trimesh.Scene, path: Path) -> Iterator[_Part]:
             if np.linalg.det(T[:3, :3]) < 0:  # mirrored: keep the front side
                 faces, colour = faces[:, ::-1], colour[:, ::-1]
                 uv = None if uv is None else uv[:, ::-1]
-        yield _Part(vertices, faces, uv, colour, image)
+        if len(textures) > 1 and uv is not None:
+            yield from _by_texture(vertices, faces, uv, _texture_numbers(shape, path), textures, folder)
+        else:
+            yield _Part(vertices, faces, uv, colour, image)
+
+
+def _texture_numbers(shape: trimesh.Trimesh, path: Path) -> I64:
+    """Number (F,) of the texture image of each face of a PLY with several (OpenMVS, MeshLab: `texnumber`).
+
+    Raises:
+        InputError: it has no such numbers, so that images can't be assigned to faces.
+    """
+    data = shape.metadata.get("_ply_raw", {}).get("face", {}).get("data")
+    names = data.dtype.names if isinstance(data, np.ndarray) else data
+    found = np.asarray(data["texnumber"]) if "texnumber" in (names or ()) else np.empty(0)
+    if found.size != len(shape.faces):
+        cause = "has several texture images, but no `texnumber` for each of its triangles"
+        raise InputError(path, cause, "Export it as OBJ, or with one texture image")
+    return found.ravel().astype(np.int64)
+
+
+def _by_texture(
+    vertices: F64, faces: I64, uv: F32, numbers: I64, textures: list[str], folder: _Folder
+) -> Iterator[_Part]:
+    """The faces of each texture image of a PLY; those without an image are uncoloured."""
+    for number in np.unique(numbers).tolist():
+        image = _image(folder, textures[number]) if 0 <= number < len(textures) else None
+        some = numbers == number
+        colour = np.full((int(some.sum()), 3, 3), UNCOLOURED if image is None else 255, np.uint8)
+        yield _Part(vertices, faces[some], None if image is None else uv[some], colour, image)
+
+
+def _image(folder: _Folder, name: str) -> Any:
+    from PIL import Image
+
+    try:
+        return Image.open(io.BytesIO(folder.get(name)))
+    except (OSError, ValueError, SyntaxError):  # `folder` reports it
+        return None
 
 
 def _look(shape: trimesh.Trimesh) -> tuple[F32 | None, U8, Any]:

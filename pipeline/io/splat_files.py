@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 NEEDS = ("gsply",)
 SH_C0 = 0.28209479177387814
 """Value of the spherical harmonic of degree 0: a colour c is stored as (c - 1/2) / SH_C0."""
+SPZ_VERSION = 3
+"""Version that viewers read; 4 (Zstandard instead of gzip) is newer than most of them."""
 SPZ_FRACTION_BITS = range(12, 7, -1)
 """Binary digits of positions after the point, finest first: a quarter of a millimetre up to 2 km from the origin, half
 a millimetre up to 4 km, and so on to 4 mm up to 32 km."""
@@ -41,7 +43,8 @@ def write(path: Path, splats: Splats, offset: F64) -> None:
     if path.suffix == ".ply":
         gsply.plywrite(path, data)
     elif path.suffix == ".spz":
-        gsply.write_spz(path, data, fractional_bits=_fraction_bits(path, float(np.abs(data.means).max(initial=0))))
+        bits = _fraction_bits(path, float(np.abs(data.means).max(initial=0)))
+        gsply.write_spz(path, data, version=SPZ_VERSION, fractional_bits=bits)
     else:
         raise SettingError(path, "has an unknown suffix", "Use .ply or .spz")
 

@@ -23,7 +23,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.parameters import NAME, Name
+from scan2sim.pipeline.core.parameters import NAME, WorldName
 from scan2sim.pipeline.io import toml
 from scan2sim.pipeline.io.tile import tile_name
 
@@ -33,7 +33,7 @@ class SurveyFile(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    name: Name
+    name: WorldName
     crs: str
     units: Literal["m", "ft", "us-ft"] | None = None
     length: float = Field(gt=0)

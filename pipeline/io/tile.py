@@ -4,7 +4,7 @@
 name = "my_street"
 crs = "EPSG:32633"          # code or WKT; "local" without georeference; default: the clouds' own
 units = "m"                 # "ft", "us-ft"; default: the unit of the CRS, else metres
-clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY, E57, PCD, XYZ, CSV; coordinates in that CRS and unit
+clouds = ["cloud.laz"]      # LAS, LAZ, COPC, PLY, E57, PCD, PTX, XYZ, CSV; coordinates in that CRS and unit
 trajectory = "path.csv"     # optional: the scanner's path, time,x,y,z or with rotations (.csv, .tum)
 orthophoto = "ortho.tif"    # optional: GeoTIFF, or JPEG, PNG, TIFF with a world file; in the CRS
 footprints = "houses.gpkg"  # optional: building footprints, GeoJSON or GeoPackage
@@ -48,7 +48,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from scan2sim.pipeline.core.classes import mapping, name_of
 from scan2sim.pipeline.core.errors import InputError, SettingError
-from scan2sim.pipeline.core.parameters import MAX_NAME, Name
+from scan2sim.pipeline.core.parameters import MAX_NAME, WorldName, is_reserved
 from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import Camera, CameraModel, Frame, RobotMap, Tile, Trajectory, View
 from scan2sim.pipeline.core.voronoi_cell import Cell
@@ -121,7 +121,7 @@ class RobotMapEntry(_Strict):
 class TileFile(_Strict):
     """Schema of `tile.toml`."""
 
-    name: Name
+    name: WorldName
     crs: str | None = None
     units: Literal["m", "ft", "us-ft"] | None = None
     clouds: tuple[str, ...] = Field(min_length=1)
@@ -246,8 +246,9 @@ def source_files(path: Path) -> list[Path]:
 
 
 def tile_name(text: str) -> str:
-    """Turn `text` into a valid tile name: letters, digits and underscores, at most `MAX_NAME`."""
-    return "".join(c if c.isascii() and c.isalnum() else "_" for c in text).strip("_")[:MAX_NAME] or "tile"
+    """Turn `text` into a valid tile name: letters, digits and underscores, at most `MAX_NAME`; "world" is reserved."""
+    name = "".join(c if c.isascii() and c.isalnum() else "_" for c in text).strip("_")[:MAX_NAME] or "tile"
+    return f"{name}_tile" if is_reserved(name) else name
 
 
 def read_spec(path: Path) -> TileFile:

@@ -70,7 +70,7 @@ def tile_folder(out: Path, overwrite: bool = False, kind: Kind = "tile") -> Iter
             else:
                 out.replace(old)
                 work.replace(out)
-            shutil.rmtree(old)
+            shutil.rmtree(old, ignore_errors=True)  # NFS can't delete the folder of a file that a program has open
         else:
             work.replace(out)
     except OSError as error:

@@ -5,6 +5,7 @@
 | .csv | a header line, then time,x,y,z[,qx,qy,qz,qw][,unsure][,sx,sy,sz[,srx,sry,srz]]: all but correlations; tables of other programs, with or without a header line (`trajectory_columns`) |
 | .tum | time x y z qx qy qz qw per line, the format of the TUM benchmark and evo |
 | .kitti | 12 numbers per line, row-major 3x4; ten poses per second unless times are given |
+| .out, .sbet | SBET of a GNSS/INS, projected to the CRS; read-only (`pipeline.io.sbet`) |
 | .geojson | the path in WGS84, and a point for each unsure section; write-only |
 
 Quaternions rotate sensor axes to world axes, scalar last. `sx` to `sz` are standard deviations in the CRS's unit,
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -27,9 +29,9 @@ import numpy as np
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError, from_os_error
 from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import F64, Frame, Trajectory
-from scan2sim.pipeline.io import file_checks, tables
+from scan2sim.pipeline.io import file_checks, foreign_files, sbet, tables
 from scan2sim.pipeline.io.geodata import crs as crs_io
-from scan2sim.pipeline.io.trajectory_columns import MATRIX, is_number, named, seconds, unnamed
+from scan2sim.pipeline.io.trajectory_columns import MATRIX, UNNAMED, is_number, named, seconds, unnamed
 
 POSITION_COLUMNS = ("time", "x", "y", "z")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
@@ -64,6 +66,8 @@ def read(
         InputError: unreadable, empty, NaN, wrong columns, times out of order, invalid rotation; names file and line.
     """
     frame = frame or Frame()
+    if sbet.is_sbet(path):
+        return sbet.read(path, frame)
     kind, lines = _lines(path)
     if kind == ".kitti":
         if timed and times is None:
@@ -168,7 +172,12 @@ def _lines(path: Path) -> tuple[str, Lines]:
     kind = path.suffix.lower()
     if kind == ".geojson":
         raise InputError(path, "is GeoJSON, which can only be written", "Give the .csv beside it")
-    filled = [(i, line) for i, line in enumerate(tables.read_text(path).splitlines(), 1) if line.strip()]
+    file_checks.check(path)
+    try:
+        text = tables.read_text(path)
+    except InputError as error:  # binary, such as SBET
+        raise foreign_files.unread(path, error.cause, error.remedy) from None
+    filled = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     plain = [(i, line) for i, line in filled if not line.lstrip().startswith("#")]
     if not plain:
         raise InputError(path, "is not a trajectory (it contains no poses)", REMEDIES.get(kind, REMEDIES[".csv"]))
@@ -178,11 +187,23 @@ def _lines(path: Path) -> tuple[str, Lines]:
         kind = ".csv" if delimiter in (",", ";") else {8: ".tum", 12: ".kitti"}.get(width, ".csv")
     if kind != ".csv" and not is_number(plain[0][1].split()[0]):
         kind = ".csv"  # a header line without #
-    if kind == ".csv":
+    if kind == ".tum" and (names := _other_order([line for _, line in filled[: filled.index(plain[0])]])):
+        kind, plain = ".csv", [(0, (delimiter or " ").join(names)), *plain]
+    elif kind == ".csv":
         plain = filled[:1] + [line for line in plain if line not in filled[:1]]
     if decimal_commas:
         plain = [(i, line.replace(",", ".")) for i, line in plain]
     return kind, [(i, line.split(delimiter)) for i, line in plain]
+
+
+def _other_order(comments: Sequence[str]) -> list[str]:
+    """Names of the columns of TUM in another order (`# timestamp tx ty tz qw qx qy qz`); empty without any."""
+    for line in comments:
+        names = re.split(r"[,;\s]+", line.strip(" #%\t,;"))
+        found = named(names)
+        if len(found) == 8 and {*found} == {*UNNAMED[8]} and found != UNNAMED[8]:
+            return names
+    return []
 
 
 def _header_line(path: Path, lines: Lines) -> tuple[tuple[str, ...], Lines]:

@@ -229,6 +229,8 @@ class Start:
 
 
 GREY, BLACK, YELLOW = (0.35, 0.35, 0.37), (0.08, 0.08, 0.08), (0.95, 0.75, 0.1)
+OPTICAL_FRAME = "camera_optical_frame"
+"""Frame of the camera's images in ROS: x right, y down, z ahead (REP 103)."""
 ROBOT = Robot(
     name="robot",
     links=(

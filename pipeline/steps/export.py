@@ -130,7 +130,7 @@ def export(inputs: Inputs, params: ExportParams, out: Path, report: Report) -> D
     metrics = {
         "triangles": {group: figures["triangles"] for group, figures in tile.groups.items()},
         "pages": {group: figures["pages"] for group, figures in tile.groups.items()},
-        "backdrop_triangles": sum(len(surface.shape) for surface in tile.backdrop()),
+        "backdrop_triangles": sum(len(surface.shape) for surface in tile.backdrop() if params.backdrop),
         "collision_triangles": len(tile.solid()),
         "bytes": sum({s.st_ino: s.st_size for s in (f.stat() for f in world.rglob("*") if f.is_file())}.values()),
     }
@@ -155,4 +155,4 @@ def can_export(params: ExportParams) -> None:
         require("export.rasters", "rasterio")
 
 
-EXPORT = Step("export", 11, export, ExportParams, check=can_export)
+EXPORT = Step("export", 12, export, ExportParams, check=can_export)

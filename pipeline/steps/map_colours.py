@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ def map_colours(inputs: Inputs, params: MapColoursParams, out: Path, report: Rep
     """Colour the classified points of `cloud`; `path` (optional) is that of the sensor.
 
     Points with colours are kept. Without colours and intensities there are none: surfaces are textured by class.
+    Files: `cloud`; `source`, JSON with the `source` of its colours: "colours" (its own), "intensity" or "classes".
     """
     from scan2sim.pipeline.lidar.intensity import has_intensity
     from scan2sim.pipeline.lidar.intensity_colours import intensity_colours
@@ -31,11 +33,15 @@ def map_colours(inputs: Inputs, params: MapColoursParams, out: Path, report: Rep
     cloud, file = PointCloud.load(inputs["cloud"]), out / "cloud.npz"
     if cloud.coloured.any() or not (params.intensity and has_intensity(cloud)):
         link_or_copy(inputs["cloud"], file)
-        return Done({"cloud": file}, {"source": "colours" if cloud.coloured.any() else "classes"})
-    report(0.2, "intensity")
-    path = Trajectory.load(inputs["path"]) if "path" in inputs else None
-    replace(cloud, rgb=intensity_colours(cloud, path)).save(file)
-    return Done({"cloud": file}, {"source": "intensity"})
+        source = "colours" if cloud.coloured.any() else "classes"
+    else:
+        report(0.2, "intensity")
+        path = Trajectory.load(inputs["path"]) if "path" in inputs else None
+        replace(cloud, rgb=intensity_colours(cloud, path)).save(file)
+        source = "intensity"
+    about = {"source": source}
+    (out / "source.json").write_text(json.dumps(about), encoding="utf-8")
+    return Done({"cloud": file, "source": out / "source.json"}, about)
 
 
-MAP_COLOURS = Step("map_colours", 2, map_colours, MapColoursParams)
+MAP_COLOURS = Step("map_colours", 3, map_colours, MapColoursParams)

@@ -54,13 +54,14 @@ class LabelParams(Params):
 def label(inputs: Inputs, params: LabelParams, out: Path, report: Report, parts: Parts = NO_PARTS) -> Done:
     """Classify every photo of `views`, with channels of `cloud` if the network takes them.
 
-    Nothing is done if the cloud keeps its own classes. Photos that an earlier run classified are not classified again.
+    Photos of cameras on their side are turned upright for the network. Nothing is done if the cloud keeps its own
+    classes. Photos that an earlier run classified are not classified again.
 
     Folder: `labels`, with `<view index>.npy`: (h, w, C) uint8 probabilities by class of `segmentation.labels`, and
     `network.json`: name, checksum, licence and classes of the network.
     """
     from scan2sim.segmentation.backends import load
-    from scan2sim.segmentation.photos import Classifier
+    from scan2sim.segmentation.photos import Classifier, quarter_turns
 
     folder = out / "labels"
     folder.mkdir()
@@ -82,16 +83,17 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report, parts:
         if view.camera.model == "orthographic":  # networks were trained on photos taken from the street
             continue
 
-        def classify(file: Path = folder / f"{i}.npy", view: View = view) -> list[Path]:
+        turns = quarter_turns(view)
+
+        def classify(file: Path = folder / f"{i}.npy", view: View = view, turns: int = turns) -> list[Path]:
             rgb, scan = image.read_photo(view), projector()
             channels = scan.channels(view, classifier.size(view.camera)) if scan else None
-            np.save(file, classifier.probabilities(rgb, view.camera, channels))
+            np.save(file, classifier.probabilities(rgb, view.camera, channels, turns))
             return [file]
 
         try:
-            parts.provide(
-                folder, [*own, i, file_digest(view.photo), views_io.to_json(view, with_paths=False)], classify
-            )
+            key = [*own, i, file_digest(view.photo), views_io.to_json(view, with_paths=False)]
+            parts.provide(folder, [*key, turns] if turns else key, classify)
         except InputError as error:
             warnings.append(f"{view.photo}: {error.cause}: not classified")
     about = {"network": info.name, "sha256": info.sha256, "licence": info.licence, "classes": classifier.classes}
@@ -131,4 +133,4 @@ def can_label(params: LabelParams) -> None:
         check(params.network, params.weights)
 
 
-LABEL = Step("label", 5, label, LabelParams, check=can_label, parts=True, memory=(1.5, 3))
+LABEL = Step("label", 6, label, LabelParams, check=can_label, parts=True, memory=(1.5, 3))

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from scan2sim.pipeline.camera import panorama
 from scan2sim.pipeline.camera.lens import changed_lens
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera
@@ -101,11 +102,13 @@ def camera_of(
     None for a perspective camera without a focal length.
 
     Raises:
-        InputError: the camera is equirectangular, but the aspect ratio isn't 2:1.
+        InputError: the camera is equirectangular, but the aspect ratio isn't 2:1; or the camera is to be found, and
+            frames of that ratio don't show the whole sphere.
     """
     w, h = video.width, video.height
-    if model == "auto":
-        model = "equirectangular" if w == 2 * h and focal is None else "pinhole"
+    if model == "auto" and w == 2 * h and focal is None:
+        panorama.check(video.path, video.first_grey())
+        model = "equirectangular"
     if model == "equirectangular":
         if abs(w - 2 * h) > 2:
             raise InputError(

@@ -22,7 +22,7 @@ from scan2sim.slam.trackers import Tracks
 from scan2sim.slam.trackers.descriptors import ViewFeatures
 from scan2sim.slam.video import Video
 
-VERSION = 13
+VERSION = 14
 """Version of the step's result. Increased whenever the same video and options give another trajectory: checkpoints and
 cached trajectories of an older version are then discarded and computed again."""
 CHECKPOINT_INTERVAL_S = 60.0

@@ -16,14 +16,10 @@ from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.images import exif
 from scan2sim.slam.reconstruction.photos import Photo, list_photos
-from scan2sim.slam.trajectory.gps import smooth
+from scan2sim.slam.trajectory.gps import ABSOLUTE_S, ZONES_S, smooth, video_clock
 
 MAX_GAP_S = 10.0
 """Gap of a GPS track up to which positions are interpolated."""
-ABSOLUTE_S = 1e8
-"""Times from which on they are UNIX times."""
-QUARTER_HOUR_S = 900.0
-"""Time zones are multiples of it from UTC."""
 MIN_POSITIONS = 3
 POSITIONS = "--positions FILE: a CSV file,x,y,z with rough positions of 3 photos or more in the cloud's coordinates"
 NEEDED = f"Give --gps TRACK (GPX, NMEA, CSV), photos with GPS in their EXIF, or {POSITIONS}"
@@ -196,15 +192,15 @@ def shifted(
         return track.shifted(offset)
     from_1970, photos_from_1970 = track.times[0] > ABSOLUTE_S, times.min() > ABSOLUTE_S
     if from_1970 and not photos_from_1970:
-        if start is not None and abs(start - track.times[0]) < 3600:
-            return track.shifted(-start)
+        if start is not None:
+            return video_clock(track, start, warn)
         warn("the first photo is assumed to be taken at the first GPS fix (see --gps-offset)")
         return track.shifted(times.min() - float(track.times[0]))
     if photos_from_1970 and not from_1970:
         raise DataError(path, "counts its times from 0, but the photos have dates", "Give --gps-offset, or --times")
     if not photos_from_1970 or zoned:
         return track
-    zones = np.arange(-56, 57) * QUARTER_HOUR_S
+    zones = ZONES_S
     inside = [((times >= track.times[0] + z) & (times <= track.times[-1] + z)).mean() for z in zones]
     best = np.flatnonzero(np.array(inside) == max(inside))
     if max(inside) < 0.5 or len(best) > 1:

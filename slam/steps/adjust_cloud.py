@@ -9,17 +9,30 @@ from typing import Any
 from pydantic import Field
 
 from scan2sim.pipeline.core.errors import ScanError
-from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
+from scan2sim.pipeline.core.step import Context, Done, Inputs, Report, Step
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io import trajectory_check
+from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.slam.steps.strip_adjustment import PoseSourceParams, write_check
 from scan2sim.slam.trajectory import cloud_sections
 from scan2sim.slam.trajectory.cloud_sections import UncheckableError
 from scan2sim.slam.trajectory.strip_adjustment import adjust
 
+HEIGHTS_M = 0.2, 8.0
+"""Usual heights of a scanner on a vehicle, a robot or a person above the ground."""
+HEIGHT_WARNING = (
+    "the trajectory is {:.1f} m above the lowest points beside it: if the scanner wasn't, its heights are of another "
+    "datum (above the ellipsoid instead of sea level, for example). Convert them to that of the clouds"
+)
 CUT = 0.5
 """Progress when the cloud is cut into sections."""
+
+
+class CloudCrs(Context):
+    """CRS of the clouds, to which an SBET file is projected."""
+
+    crs: str = crs_io.LOCAL
 
 
 class AdjustCloudParams(PoseSourceParams):
@@ -30,6 +43,7 @@ class AdjustCloudParams(PoseSourceParams):
     """
 
     unit: float = Field(1.0, gt=0, description="Metres per unit of the coordinates.")
+    context: CloudCrs = CloudCrs()
 
 
 def adjust_cloud(inputs: Inputs, params: AdjustCloudParams, out: Path, report: Report) -> Done:
@@ -42,14 +56,14 @@ def adjust_cloud(inputs: Inputs, params: AdjustCloudParams, out: Path, report: R
         ScanError: a file can't be read.
     """
     clouds = [path for name, path in sorted(inputs.items()) if name.startswith("cloud.")]
-    frame = Frame(unit=params.unit)
+    frame = Frame(params.context.crs, unit=params.unit)
     path = trajectory_io.read(inputs["trajectory"], frame, ordered=False, timed=True)
     path = replace(path, unsure=None, covariance=None)
     try:
         if len(path) < 2:
             raise UncheckableError("the trajectory has only one position")
-        offset = cloud_sections.clock_offset(clouds, path, frame)
-        path = replace(path, times=path.times + offset)
+        found = cloud_sections.match(clouds, path, frame)
+        path = replace(path, times=path.times + found.offset)
         sections = cloud_sections.read(clouds, path, frame, lambda part, text="": report(CUT * part, text))
     except UncheckableError as error:
         return _unchecked(out, str(error), [])
@@ -70,10 +84,14 @@ def adjust_cloud(inputs: Inputs, params: AdjustCloudParams, out: Path, report: R
         data="sections",
     )  # fmt: skip
     notes = dict[str, Any]()
-    if offset:
-        notes = {"clock_offset_s": offset}
+    if found.offset:
+        notes["clock_offset_s"] = found.offset
+    warnings = adjusted.warnings()
+    if found.height < HEIGHTS_M[0] or found.height > HEIGHTS_M[1]:
+        notes["scanner_height_m"] = round(found.height, 2)
+        warnings.append(HEIGHT_WARNING.format(found.height))
     check = write_check(out / "check", sections.times, sections.poses, adjusted, notes)
-    return Done({"check": check}, adjusted.figures(sections.times) | notes, adjusted.warnings())
+    return Done({"check": check}, adjusted.figures(sections.times) | notes, warnings)
 
 
 def _unchecked(out: Path, why: str, warnings: list[str]) -> Done:

@@ -76,16 +76,17 @@ def reconstruct(inputs: Inputs, params: Reconstructed, out: Path, report: Report
     source, is_video = inputs["photos"], inputs["photos"].is_file()
     warnings: list[str] = []
     if is_video:
-        focal_35mm = open_video(source).focal_35mm
-        images = out / "frames"
+        video, images = open_video(source), out / "frames"
         photos = photos_io.extract_frames(
-            source, images, params.fps, params.until, focal_35mm, part(report, 0, 0.1), warnings.append
+            video, images, params.fps, params.until, part(report, 0, 0.1), warnings.append
         )
     else:
         images = source
         photos, warnings = photos_io.read_photos(source, part(report, 0, 0.1))
         if "times" in inputs:
             photos = photos_io.with_times(photos, photos_io.list_photos(source), inputs["times"])
+    if params.focal is None:
+        photos_io.check_perspective(source, images / photos[0].name, photos[0])
     database, staged = checkpoint / "database.db", checkpoint / "images"
     names = photos_io.stage(photos, images, staged)
     fixed = _extract(database, staged, photos, names, params, part(report, 0.1, 0.4))
@@ -248,5 +249,5 @@ def can_reconstruct(params: Reconstructed) -> None:
 
 
 RECONSTRUCT = Step(
-    "reconstruct", 1, reconstruct, Reconstructed, check=can_reconstruct, resumes=True, memory=(1.5, 0)
+    "reconstruct", 2, reconstruct, Reconstructed, check=can_reconstruct, resumes=True, memory=(1.5, 0)
 )  # fmt: skip

@@ -25,7 +25,7 @@ from scan2sim.slam.odometry.odometry import Odometry, OdometryParams
 from scan2sim.slam.odometry.track_log import RecordingTracker, Replay, TrackLog, record_tracks
 from scan2sim.slam.odometry.video_odometry import VERSION, Run, track
 from scan2sim.slam.trackers import Tracker
-from scan2sim.slam.trajectory.gps import smooth
+from scan2sim.slam.trajectory.gps import ABSOLUTE_S, smooth, video_clock
 from scan2sim.slam.video import Video, open_video
 from scan2sim.slam.virtual_cameras import VirtualViews
 
@@ -253,12 +253,11 @@ def read_gps(video: Video, path: Path | None, offset: float | None, warn: Callab
     if path is None:
         return None
     gps = gps_io.read(path)
-    absolute = gps.times[0] > 1e8
     if offset is not None:
         gps = gps.shifted(offset)
-    elif absolute and video.start is not None and abs(video.start - gps.times[0]) < 3600:
-        gps = gps.shifted(-video.start)
-    elif absolute:
+    elif gps.times[0] > ABSOLUTE_S and video.start is not None:
+        gps = video_clock(gps, video.start, warn)
+    elif gps.times[0] > ABSOLUTE_S:
         warn("the video has no start time: its first frame is assumed to be at the first GPS fix (see --gps-offset)")
         gps = gps.shifted(-float(gps.times[0]))
     return smooth(gps)

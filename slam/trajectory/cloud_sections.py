@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,6 +46,12 @@ class SectionModel:
     """Points of each cloud by which the clocks of cloud and path are compared."""
     matching_share_min: float = 0.5
     """Least share of these points that the path passes within range at their time."""
+    beside_m: float = 8.0
+    """Horizontal distance of the points by which the height of the scanner is measured."""
+    beside_min: int = 100
+    """Number of these points below which it isn't."""
+    lowest_percentile: float = 5.0
+    """Percentile of their heights that is the ground's."""
 
 
 MODEL = SectionModel()
@@ -96,8 +103,20 @@ class Sections:
         return (world - path.T[i, :3, 3]) @ path.T[i, :3, :3]
 
 
-def clock_offset(clouds: Sequence[Path], path: Trajectory, frame: Frame) -> float:
-    """Seconds to add to the path's times, to convert them to the clock of the clouds.
+class Match(NamedTuple):
+    """How a path fits to clouds.
+
+    Attributes:
+        offset: seconds to add to the path's times, to convert them to the clock of the clouds.
+        height: metres of the scanner above the lowest points beside it, in the middle; NaN if there are too few.
+    """
+
+    offset: float
+    height: float
+
+
+def match(clouds: Sequence[Path], path: Trajectory, frame: Frame) -> Match:
+    """Clock of a path, and its height above the ground, by points of the clouds.
 
     Args:
         clouds: files in one CRS.
@@ -105,30 +124,52 @@ def clock_offset(clouds: Sequence[Path], path: Trajectory, frame: Frame) -> floa
         frame: CRS and unit of the clouds.
 
     Raises:
-        UncheckableError: points have no times, or none of the usual clocks matches.
+        UncheckableError: points have no times, none of the usual clocks matches, or points are too far away.
         ScanError: a cloud can't be read.
     """
     samples = [_sample(cloud, frame) for cloud in clouds]
     xyz, times = (np.concatenate(parts) for parts in zip(*samples, strict=True))
 
-    def share(offset: float) -> float:
+    def from_path(offset: float) -> F64:
+        """(N, 3) from the scanner to the points that it measured; infinite outside of the path."""
         at = times - offset
         within = (at >= path.times[0] - 1) & (at <= path.times[-1] + 1)
-        near = np.linalg.norm(xyz - path.at(at), axis=1) < scan_pairs.MODEL.range_m
-        return float((within & near).mean())
+        return np.where(within[:, None], xyz - path.at(at), np.inf)
 
-    if share(0.0) >= MODEL.matching_share_min:
-        return 0.0
+    def near(offset: float, axes: int = 2) -> float:
+        distance = np.linalg.norm(from_path(offset)[:, :axes], axis=1)
+        return float((distance < scan_pairs.MODEL.range_m).mean())
+
     spans = (float(np.median(times)), float(path.times[0] + path.times[-1]) / 2)
-    found = max(((share(offset), offset) for offset in clock_offsets(*spans)), default=(0.0, 0.0))
-    if found[0] >= MODEL.matching_share_min:
-        return found[1]
-    if ((times >= path.times[0] - 1) & (times <= path.times[-1] + 1)).mean() >= MODEL.matching_share_min:
+    offset = 0.0
+    if near(0.0) < MODEL.matching_share_min:
+        share, offset = max(((near(offset), offset) for offset in clock_offsets(*spans)), default=(0.0, 0.0))
+        if share < MODEL.matching_share_min:
+            raise _no_clock(times, path)
+    found = Match(offset, _height(from_path(offset)))
+    if near(offset, axes=3) < MODEL.matching_share_min:
         raise UncheckableError(
+            f"most points are farther than {scan_pairs.MODEL.range_m:.0f} m from the trajectory at their time, which "
+            f"is {found.height:.0f} m above the lowest ones beside it: an airborne cloud, or heights of another datum"
+        )
+    return found
+
+
+def _height(from_path: F64) -> float:
+    """Height (m) of the scanner above the lowest of the points (N, 3) beside it; NaN if there are too few."""
+    beside = from_path[np.hypot(from_path[:, 0], from_path[:, 1]) < MODEL.beside_m, 2]
+    if len(beside) < MODEL.beside_min:
+        return float("nan")
+    return -float(np.percentile(beside, MODEL.lowest_percentile))
+
+
+def _no_clock(times: F64, path: Trajectory) -> UncheckableError:
+    if ((times >= path.times[0] - 1) & (times <= path.times[-1] + 1)).mean() >= MODEL.matching_share_min:
+        return UncheckableError(
             f"most points are farther than {scan_pairs.MODEL.range_m:.0f} m from the trajectory at their time: an "
             "airborne cloud, or clocks that differ"
         )
-    raise UncheckableError(
+    return UncheckableError(
         f"the points' times are {times.min():.1f} to {times.max():.1f} s, those of the trajectory "
         f"{path.times[0]:.1f} to {path.times[-1]:.1f} s, which isn't the same time in another GPS or UNIX clock"
     )

@@ -1,13 +1,52 @@
-"""Smoothing and noise estimation of GPS tracks; `pipeline.io.gps` reads them."""
+"""Smoothing, noise and clocks of GPS tracks; `pipeline.io.gps` reads them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 
 from scan2sim.pipeline.core.types import F64, GpsTrack
+
+ABSOLUTE_S = 1e8
+"""Times above this count from 1970, others from the start of a recording."""
+NEAR_S = 3600.0
+"""Time by which a video may begin before its GPS track, seconds."""
+ZONES_S = 900.0 * np.arange(-56, 57)
+"""Time zones: seconds that local time is ahead of UTC."""
+
+
+def video_clock(track: GpsTrack, start: float, warn: Callable[[str], None]) -> GpsTrack:
+    """A track with UNIX times in a video's time, which counts from its first frame.
+
+    The video's start lies within the track, by UTC or, as action cameras write it, by local time. Otherwise the first
+    frame is assumed to be at the first fix. `warn` receives what was assumed.
+
+    Args:
+        track: the track.
+        start: UNIX time of the first frame by the video's metadata.
+        warn: receives a warning.
+    """
+    first, last = float(track.times[0]), float(track.times[-1])
+    if first - NEAR_S < start < max(last, first + NEAR_S):
+        return track.shifted(-start)
+    zones = ZONES_S[(start - ZONES_S >= first) & (start - ZONES_S <= last)]
+    if len(zones) == 1:
+        warn(f"the video's clock is assumed to be {zones[0] / 3600:+g} h from UTC (see --gps-offset)")
+        return track.shifted(float(zones[0]) - start)
+    began, covered = _date(start), f"{_date(first)} to {_date(last)}"
+    warn(
+        f"the video's start by its metadata ({began}) isn't within the GPS track ({covered}): its first frame is "
+        "assumed to be at the first fix (see --gps-offset)"
+    )
+    return track.shifted(-first)
+
+
+def _date(seconds: float) -> str:
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def smooth(track: GpsTrack, seconds: float = 1.0, max_gap: float = 3.0) -> GpsTrack:

@@ -11,6 +11,13 @@ from tests.conftest import ROOT
 SERVICES: dict[str, Any] = yaml.safe_load((ROOT / "compose.yaml").read_text(encoding="utf-8"))["services"]
 
 
+def test_services_reach_each_other_where_docker_passes_a_proxy_on() -> None:
+    for name in ("server", "setup", "worker"):
+        for variable in ("NO_PROXY", "no_proxy"):
+            hosts = SERVICES[name]["environment"][variable].rpartition("}")[2].split(",")
+            assert {"localhost", "server", "database", "broker"} <= set(hosts), name
+
+
 def listeners(text: str) -> dict[str, str]:
     """Addresses by name of the listener."""
     return dict(one.split("://") for one in text.split(","))

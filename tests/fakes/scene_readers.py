@@ -169,9 +169,10 @@ TAGS = {"Terrain": 2, "Building": 6, "TrafficSign": 64}
 
 
 def carla(folder: Path, scene: Scene) -> Iterator[Shown]:
-    about = json.loads((folder / "carla" / f"{scene.name}.json").read_text(encoding="utf-8"))
-    files = {file: "" for ground in about["maps"] for file in ground.get("tiles", [ground.get("source")])}
-    for file, tag in (files | {prop["source"]: prop["tag"] for prop in about["props"]}).items():
+    packages = [json.loads(path.read_text(encoding="utf-8")) for path in sorted((folder / "carla").glob("*.json"))]
+    maps, props = ([entry for package in packages for entry in package[kind]] for kind in ("maps", "props"))
+    files = {file: "" for ground in maps for file in ground.get("tiles", [ground.get("source")])}
+    for file, tag in (files | {prop["source"]: prop["tag"] for prop in props}).items():
         for name, corners, uv, picture in fbx(folder / "carla" / file):
             kind = tag or name.removeprefix(f"{scene.name}_").split("_")[0]
             yield Shown(TAGS[kind], corners, uv, image(picture))

@@ -72,14 +72,18 @@ class Passes:
         path = Trajectory(self.times[:count], poses[:count, :3, 3], poses[:count, :3, :3])
         trajectory_io.write(folder / "poses.csv", path)
 
-    def assemble(self, folder: Path, poses: F64, *, clock_s: float = 0.0, timed: bool = True) -> None:
-        """Write cloud.laz, merged by poses (N, 4, 4), and path.csv, positions without rotations."""
+    def assemble(
+        self, folder: Path, poses: F64, *, clock_s: float = 0.0, timed: bool = True, frame: Frame | None = None
+    ) -> None:
+        """Write cloud.laz, merged by local poses (N, 4, 4), and path.csv, positions without rotations."""
         parts = [(self.sweep(i), poses[i], self.times[i]) for i in range(len(self.times))]
         xyz = np.concatenate([points @ T[:3, :3].T + T[:3, 3] for points, T, _ in parts]).astype(np.float32)
         times = np.concatenate([np.full(len(points), time + clock_s) for points, _, time in parts])
         folder.mkdir(parents=True, exist_ok=True)
         intensity = np.arange(len(xyz)).astype(np.uint16)
-        las.write(folder / "cloud.laz", PointCloud(Frame(), xyz, time=times if timed else None, intensity=intensity))
+        las.write(
+            folder / "cloud.laz", PointCloud(frame or Frame(), xyz, time=times if timed else None, intensity=intensity)
+        )
         trajectory_io.write(folder / "path.csv", Trajectory(self.times, poses[:, :3, 3]))
 
 

@@ -106,20 +106,24 @@ class DrivenEndpoint(ABC):
 
         def driven_and_what() -> bool:
             if not self.driven:
-                self.start()
+                self.start(what)
             return what()
 
         self.until(driven_and_what, controls, seconds)
 
-    def start(self) -> None:
-        """Confirm a stop until the adapter has left it; begins again if orders were late, or it has stopped again."""
+    def start(self, unless: Callable[[], bool] = lambda: False) -> None:
+        """Confirm a stop until the adapter has left it; begins again if orders were late, or it has stopped again.
+
+        Args:
+            unless: condition under which it may stand.
+        """
 
         def drives() -> bool:
             return self.driven and self.end.answer is not None and not self.end.answer.standing
 
         self.until(lambda: self.end.answer is not None)
         end = self.clock() + 60
-        while not drives():
+        while not (unless() or drives()):
             assert self.clock() < end, self.end.answer
             self.driven = False
             for _ in range(5):

@@ -522,8 +522,9 @@ def test_versions_include_all_packages_that_steps_use(monkeypatch: pytest.Monkey
     computing |= {package for package, extra in EXTRA_OF.items() if extra not in EXTRAS_WITHOUT_STEPS} - {
         "pxr",
         "kiss_icp",
+        "pillow_heif",
     }
-    computing |= {"usd-core", "kiss-icp"}
+    computing |= {"usd-core", "kiss-icp", "pillow-heif"}
     assert computing <= found.keys()
     assert found["scan2sim"] == scan2sim.__version__ and not {"prefect", "ray", "s3fs", "pytest"} & found.keys()
 

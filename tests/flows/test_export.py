@@ -86,6 +86,12 @@ def test_unknown_format_lists_available_ones(tmp_path: Path) -> None:
         run(tmp_path / "tile", "--to", "glb", "--out", tmp_path / "out")
 
 
+def test_carla_map_without_roads_is_a_warning(tmp_path: Path) -> None:
+    world = synthetic.world(tmp_path).files["world"]
+    assert "CARLA's map has no OpenDRIVE" in run(world, "--to", "carla", "--out", tmp_path / "out").replace("\n", " ")
+    assert "CARLA" not in run(world, "--to", "glb", "--out", tmp_path / "glb")
+
+
 def test_world_without_crs_is_a_warning(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path, frame=Frame()).files["world"]
     assert "has no CRS" in run(world, "--to", "glb", "--out", tmp_path / "out")

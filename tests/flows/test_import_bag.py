@@ -163,6 +163,17 @@ def test_steps_depend_on_what_the_bag_contains(tmp_path: Path) -> None:
     assert plain["import_sweeps"].params.deskew == "none"  # type: ignore[attr-defined]
 
 
+def test_import_reports_the_lidars_that_it_leaves_out(tmp_path: Path) -> None:
+    def second(bag: BagFile, k: int, time: float) -> None:
+        bag.cloud("/second", time, "unknown", records(XYZ[:20]))
+
+    path = write(tmp_path / "bag", "mcap", tf, points, second)
+    result = command("import", "bag", path, "--out", tmp_path / "tile", "--min-range", 0)
+    assert result.exit_code == 0
+    for shown in (result.output, command("inspect", path).output):
+        assert "/second is left out: no static transform to 'lidar' from 'unknown'" in shown
+
+
 def test_drive_with_a_bag_becomes_a_survey_and_is_cached(tmp_path: Path) -> None:
     write(tmp_path / "bag", "sqlite3", sweeps=25)
     place = drive(tmp_path, '[bag]\nfile = "bag"\nmin_range = 0.5\nlidar = ["/points"]\n[tiles]\nlength = 20.0\n')

@@ -101,7 +101,8 @@ def test_world_with_parked_cars(tmp_path: Path) -> None:
         assert result.exit_code == 0, result.output
     assert not list((tmp_path / "remove").rglob("vehicle.*"))
     (meshes,) = (file.parent for file in (tmp_path / "keep" / "world" / "models").rglob("vehicle.obj"))
-    assert {"vehicle.obj", "vehicle.dae", "vehicle.mtl", "vehicle_0.png"} <= {f.name for f in meshes.iterdir()}
+    assert {"vehicle.obj", "vehicle.dae", "vehicle.mtl"} <= {f.name for f in meshes.iterdir()}
+    assert list(meshes.glob("*_vehicle_0.png"))
     assert "vehicle.obj" in (meshes.parent / "model.sdf").read_text(encoding="utf-8")
     report = json.loads((tmp_path / "keep" / "report.json").read_text(encoding="utf-8"))
     assert 0 < report["geometry"]["triangles"]["vehicle"] <= 50_000

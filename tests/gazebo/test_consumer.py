@@ -71,7 +71,7 @@ def test_ground_5_cm_off_the_cloud_is_a_fault(world: Path) -> None:
 
 
 def test_a_broken_world_is_a_fault(world: Path) -> None:
-    (world / "models/street/meshes/terrain_1.png").unlink()
+    (world / "models/street/meshes/street_terrain_1.png").unlink()
     with pytest.raises(Fault, match="terrain_1"):
         gazebo.check(world, reference())
 

@@ -42,7 +42,7 @@ def test_all_meshes_and_textures_load(world: Path) -> None:
         group = Path(mesh["file"]).stem
         if group.startswith("collision"):
             continue
-        assert mesh["textures"] == [f"{group}_0.png", f"{group}_1.png"]
+        assert mesh["textures"] == [f"street_{group}_0.png", f"street_{group}_1.png"]
         low, high = ((-10, -10), (10, 10)) if group == "terrain" else ((4, 2, -0.5), (7, 4, 4.5))
         assert mesh["low"][: len(low)] == pytest.approx(low, abs=1e-3)
         assert mesh["high"][: len(high)] == pytest.approx(high, abs=1e-3)
@@ -119,7 +119,7 @@ def _replace(path: Path, old: str, new: str) -> None:
 
 
 def test_a_missing_texture_is_rejected(world: Path) -> None:
-    (world.parent / "models/street/meshes/terrain_1.png").unlink()
+    (world.parent / "models/street/meshes/street_terrain_1.png").unlink()
     with pytest.raises(WorldRejected, match="terrain_1"):
         check_world(world)
 

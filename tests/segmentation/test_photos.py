@@ -2,16 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import F32, U8, Camera
+from scan2sim.pipeline.core.types import F32, U8, Camera, View
 from scan2sim.segmentation.backends import NetworkInfo
 from scan2sim.segmentation.labels import CLASSES, IGNORED, LABEL_SETS, code_of_index, index_of_code, map_labels
-from scan2sim.segmentation.photos import TILE_OVERLAP_PX, Classifier, class_map
+from scan2sim.segmentation.photos import TILE_OVERLAP_PX, Classifier, class_map, quarter_turns
 
 PINHOLE = Camera("pinhole", 640, 480, 500.0, 500.0, 319.5, 239.5)
 PANORAMA = Camera("equirectangular", 1024, 512)
@@ -126,3 +127,41 @@ def test_other_label_sets_are_mapped_by_name() -> None:
 def test_all_labels_map_to_classes_and_codes_round_trip() -> None:
     assert all(ours in CLASSES for table in LABEL_SETS.values() for ours in table.values())
     assert index_of_code()[code_of_index()].tolist() == list(range(len(CLASSES)))
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_photos_of_a_camera_on_its_side_are_classified_upright(turns: int) -> None:
+    class ByHeight(ByColour):
+        """Predicts the first class in the upper half of what it is given, and the last one below."""
+
+        def probabilities(self, seen: U8) -> F32:
+            height, width = seen.shape[0] // 4, seen.shape[1] // 4
+            out = np.zeros((len(CLASSES), height, width), np.float32)
+            out[0, : height // 2], out[-1, height // 2 :] = 1, 1
+            self.seen.append(seen.shape)
+            return out
+
+    upright = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # looks along x
+    angle = -turns * np.pi / 2
+    roll = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, :3] = upright @ roll
+    camera = PINHOLE if turns % 2 == 0 else replace(PINHOLE, width=480, height=640, cx=239.5, cy=319.5)
+    assert quarter_turns(View("a", camera, pose, Path("a.jpg"))) == turns
+    network = ByHeight()
+    rgb = np.zeros((camera.height, camera.width, 3), np.uint8)
+    found = Classifier(network, "").probabilities(rgb, camera, turns=turns)
+    assert network.seen[0][:2] == (480, 640)
+    v, u = np.mgrid[: found.shape[0], : found.shape[1]].astype(float)
+    rays = np.stack([u - (found.shape[1] - 1) / 2, v - (found.shape[0] - 1) / 2, np.full(u.shape, 125.0)], axis=-1)
+    above = (rays @ pose[:3, :3].T)[..., 2] > 0
+    assert ((found[..., 0] > 127) == above).mean() > 0.98 and ((found[..., -1] > 127) == ~above).mean() > 0.98
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, PANORAMA])
+def test_cameras_without_an_upright_photo_are_not_turned(camera: Camera) -> None:
+    down = np.eye(4)
+    down[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    if camera is PANORAMA:
+        down[:3, :3] = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])  # its right side up
+    assert quarter_turns(View("a", camera, down, Path("a.jpg"))) == 0

@@ -182,7 +182,7 @@ def test_dome_is_rebuilt_only_when_the_sky_of_a_tile_changes(tmp_path: Path) -> 
         dome.of_survey(scene, folder)
 
     texture = tmp_path / "world" / SCENE_FOLDER / DOME_FOLDER / BACKDROP / "page_1.png"
-    mesh = tmp_path / "world" / "models" / "tile1" / "meshes" / "terrain_0.png"
+    mesh = tmp_path / "world" / "models" / "tile1" / "meshes" / "tile1_terrain_0.png"
     pictures, grounds = [], []
     for exposure in (None, 0.7):
         if exposure is not None:
@@ -195,7 +195,7 @@ def test_dome_is_rebuilt_only_when_the_sky_of_a_tile_changes(tmp_path: Path) -> 
         grounds.append(mesh.stat().st_ino)
     assert made == [2, 2] and pictures[0] != pictures[1]
     assert grounds[0] == grounds[1]  # the tiles' own files are the same
-    page = tmp_path / "world" / "models" / "town_sky" / "meshes" / "backdrop_sky_1.png"
+    page = tmp_path / "world" / "models" / "town_sky" / "meshes" / "town_sky_backdrop_sky_1.png"
     whole = page.read_bytes()
     page.write_bytes(b"damaged")
     assemble(tmp_path, "town", tiles, dome=make)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 
 from scan2sim.pipeline.core.classes import Group, surface_of
 from scan2sim.pipeline.core.step import Inputs
-from scan2sim.pipeline.core.types import F32, U8, PointCloud
+from scan2sim.pipeline.core.types import F32, U8, Bools, PointCloud
 from scan2sim.pipeline.geometry.height_map import exact_point_spacing
 from scan2sim.texturing.inpainting.ground import GroundOrthophoto
 from scan2sim.texturing.inpainting.hole_filling import PointColours, shaded
@@ -18,7 +20,8 @@ def point_colours(
 ) -> tuple[PointColours | None, bool]:
     """Colours of the points, and whether they were measured (else they are class colours); None if there are no points.
 
-    Class colours are those of the points of `surface`, if it has any: a floor isn't stained by the furniture on it.
+    Class colours, and shades of them by intensity (`colour_source`), are those of the points of `surface`, if it has
+    any: a floor isn't stained by the furniture on it, or by walls.
     Points of `uncovered` are sparser than others. Texels coloured by synthesized points (`synthesized.*`) are marked as
     filled. Points at and beside removed vehicles
     and people of the `ground` orthophoto are not used: they have the colour of the object or of its shadow.
@@ -31,12 +34,14 @@ def point_colours(
         return None, False
     cloud = PointCloud.join(clouds)
     if cloud.rgb is None:
-        cloud = _of_surface(cloud, surface)
+        cloud = cloud.take(_of_surface(cloud, surface, np.ones(len(cloud), bool)))
         return PointColours(cloud.xyz, shaded(classes_of(cloud), cloud.normal), FILLED), False
     measured = np.arange(len(cloud)) < len(cloud) - sum(len(PointCloud.load(inputs[name])) for name in synthesized)
     usable = cloud.coloured
     if ground is not None:
         usable &= ~ground.near_removed(cloud.xyz)
+    if _tinted(inputs):
+        usable = _of_surface(cloud, surface, usable)
     if not usable.any():
         return None, False
     mark = np.where(measured, FROM_POINTS, FILLED)[usable].astype(np.uint8)
@@ -47,12 +52,18 @@ def point_colours(
     return PointColours(cloud.xyz[usable], cloud.rgb[usable], mark, spacing[usable]), True
 
 
-def _of_surface(cloud: PointCloud, surface: Group | None) -> PointCloud:
-    """The points whose classes have this surface; all of them if none has."""
+def _tinted(inputs: Inputs) -> bool:
+    """Whether the points of a robot's map have shades of their classes' colours (step `map_colours`)."""
+    source = inputs.get("colour_source")
+    return source is not None and json.loads(source.read_text(encoding="utf-8"))["source"] == "intensity"
+
+
+def _of_surface(cloud: PointCloud, surface: Group | None, usable: Bools) -> Bools:
+    """(N,) those of the `usable` points whose classes have this surface; all of them if none has."""
     if surface is None:
-        return cloud
-    own = surface_of([surface])[classes_of(cloud)] == 0
-    return cloud.take(own) if own.any() else cloud
+        return usable
+    own = usable & (surface_of([surface])[classes_of(cloud)] == 0)
+    return own if own.any() else usable
 
 
 def _finest(inputs: Inputs, name: str) -> PointCloud:

@@ -16,6 +16,10 @@ MODELS: dict[str, CameraModel] = {
 LENGTHS: dict[CameraModel, tuple[int, ...]] = {"opencv": (4, 5, 8), "fisheye": (4,)}
 
 
+MAX_OFF_CENTRE = 0.05
+"""Largest usual distance of a principal point from the middle of the image, as a share of its width."""
+
+
 class InvalidCamera(Exception):
     """A CameraInfo from which no camera can be made; the text says why."""
 
@@ -54,6 +58,30 @@ def camera_of(info: Any, *, rectified: bool) -> Camera:
     if wanted is None or not np.isfinite(D).all():
         raise InvalidCamera(f"has {len(D)} coefficients of the model {name!r}")
     return Camera(model, *size, float(fx), float(fy), float(cx), float(cy), tuple(float(d) for d in D[:wanted]))
+
+
+def has_only_projection(info: Any) -> bool:
+    """Whether a `CameraInfo` has P, but no K: that of images which were rectified."""
+    K, P = (np.asarray(_field(info, name), np.float64) for name in "kp")
+    return not K.any() and bool(P[0] > 0)
+
+
+def looks_rectified(info: Any) -> bool:
+    """Whether the images of a `CameraInfo` with distortion have the size of rectified ones: by the principal points.
+
+    That of K is far from the middle then, that of P isn't (kitti2bag: rectified images with K and D of the raw ones).
+    """
+    K, D, P = (np.asarray(_field(info, name), np.float64) for name in "kdp")
+    if not (K[0] > 0 and P[0] > 0 and D.any()):
+        return False
+    middle = np.array([info.width, info.height]) / 2
+    raw, rectified = (float(np.linalg.norm(centre - middle)) for centre in (K[[2, 5]], P[[2, 6]]))
+    return raw > MAX_OFF_CENTRE * float(info.width) and rectified < raw / 2
+
+
+def camera_offset(info: Any) -> float:
+    """Offset of a camera from its frame by P of its `CameraInfo`: not 0 for the second camera of a stereo pair."""
+    return float(_field(info, "p")[3])
 
 
 def _field(info: Any, name: str) -> Any:

@@ -43,8 +43,12 @@ class Contents:
         bag: the open bag.
         first: first message of each topic of a known kind, decoded; of lidars, a `RawSweep`, or an `InvalidCloud`.
         headers: headers of these messages; without those of `tf`.
+        lags: seconds from the time stamp of a topic's message until it was recorded, the smallest of its samples;
+            without messages that have no time stamp.
+        link_lags: the same for moving transforms, by (parent, child).
         frames: all static transforms, and the moving ones of the first seconds.
-        samples: messages of kinds odometry, fix and imu in the first seconds, decoded, by topic.
+        samples: messages of kinds odometry, fix and imu in the first seconds, and of the latter two one in the middle,
+            decoded, by topic.
     """
 
     bag: Bag
@@ -52,6 +56,8 @@ class Contents:
     headers: dict[str, Header] = field(default_factory=dict)
     frames: Frames = field(init=False)
     samples: dict[str, list[Any]] = field(default_factory=dict)
+    lags: dict[str, float] = field(default_factory=dict)
+    link_lags: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.frames = Frames(self.bag.path)
@@ -69,8 +75,8 @@ class Contents:
         return KINDS.get(self.bag.topics[topic].type, "")
 
     def frame(self, topic: str) -> str:
-        """Frame of a topic's first message."""
-        return self.headers[topic].frame
+        """Frame of a topic's first message; the name of the topic if its header names none."""
+        return self.headers[topic].frame or plain(topic)
 
 
 def inspected(bag: Bag) -> Contents:
@@ -93,13 +99,13 @@ def inspected(bag: Bag) -> Contents:
         _sample(found, message)
     for share in PROBED_SHARES:
         for message in bag.messages([name for name in found.topics("tf") if name not in static], PROBE_S, share):
-            add_transforms(found.frames, bag, message)
+            add_transforms(found.frames, bag, message, lags=found.link_lags)
     found.frames.fix_constant()
     for name in known:
         if name not in found.first and name not in static:
-            for message in bag.messages([name]):
-                _sample(found, message)
-                break
+            _sample_one(found, name, 0.0)
+    for name in found.topics("fix", "imu"):  # a receiver or an INS may start later
+        _sample_one(found, name, 0.5)
     return found
 
 
@@ -114,6 +120,7 @@ def add_transforms(
     message: Message,
     log_times: bool = False,
     links: Collection[tuple[str, str]] | None = None,
+    lags: dict[tuple[str, str], float] | None = None,
 ) -> None:
     """Add the transforms of a TFMessage.
 
@@ -123,6 +130,7 @@ def add_transforms(
         message: the message.
         log_times: take the time at which it was recorded, instead of those of the headers.
         links: add only these; None: all.
+        lags: receives seconds from time stamp to recording of moving transforms (`Contents.link_lags`).
 
     Raises:
         InputError: it can't be decoded, or a transform is invalid.
@@ -138,7 +146,10 @@ def add_transforms(
         if is_static(message.topic):
             frames.static[link] = T
         else:
-            time = message.log_ns * 1e-9 if log_times else stamp_seconds(one)
+            stamp = stamp_seconds(one)
+            time = message.log_ns * 1e-9 if log_times else stamp
+            if lags is not None and stamp:
+                lags[link] = min(lags.get(link, np.inf), message.log_ns * 1e-9 - stamp, key=abs)
             frames.moving.setdefault(link, Series()).add(time, T)
 
 
@@ -153,13 +164,24 @@ def decode_sweep(bag: Bag, message: Message) -> RawSweep:
     return point_cloud2.decode(bag.decode(message))
 
 
+def _sample_one(found: Contents, topic: str, share: float) -> None:
+    """Keep what is needed of a topic's first message after a share of the recording."""
+    for message in found.bag.messages([topic], share=share):
+        _sample(found, message)
+        break
+
+
 def _sample(found: Contents, message: Message) -> None:
     """Keep what is needed of a message."""
     bag, kind, topic = found.bag, found.kind(message.topic), message.topic
     if kind == "tf":
-        add_transforms(found.frames, bag, message)
+        add_transforms(found.frames, bag, message, lags=found.link_lags)
         found.first[topic] = None
         return
+    if topic not in found.first or kind in ("odometry", "fix", "imu"):
+        stamp_ns = bag.header(message).stamp_ns
+        if stamp_ns:
+            found.lags[topic] = min(found.lags.get(topic, np.inf), (message.log_ns - stamp_ns) * 1e-9, key=abs)
     if topic not in found.first:
         found.headers[topic] = bag.header(message)
         found.first[topic] = None

@@ -31,13 +31,19 @@ class InvalidImage(Exception):
     """An image that can't be decoded; the text says why."""
 
 
+def is_depth(encoding: str) -> bool:
+    """Whether an encoding, or a `CompressedImage.format` such as "16UC1; png compressed", is that of depths."""
+    return "compressedDepth" in encoding or encoding.partition(";")[0].strip() in DEPTH_ENCODINGS
+
+
 def colours(encoding: str) -> bool:
-    """Whether images of an encoding show colours."""
-    return not encoding.lower().startswith(("mono", "8uc1", "16uc1", "32fc1", "64fc1"))
+    """Whether images of an encoding, or of a `CompressedImage.format` such as "bgr8; jpeg compressed", show colours."""
+    first, _, stored = encoding.lower().partition(";")
+    return not first.startswith(("mono", "8uc1", "16uc1", "32fc1", "64fc1")) and "mono" not in stored
 
 
 def compressed_file(image: Any) -> tuple[str, bytes]:
-    """Suffix and content of the file of a `CompressedImage`: its bytes, unchanged.
+    """Suffix and content of the file of a `CompressedImage`: its bytes, unchanged; PNG of a compressed Bayer pattern.
 
     Raises:
         InvalidImage: it is empty, or neither JPEG nor PNG.
@@ -49,8 +55,43 @@ def compressed_file(image: Any) -> tuple[str, bytes]:
         jpeg = content.startswith(JPEG)
         if (JPEG_END if jpeg else PNG_END) not in content[-TAIL_BYTES:]:
             raise InvalidImage("is truncated")
-        return ".jpg" if jpeg else ".png", content
+        pattern = _bayer_pattern(str(image.format))
+        return (".jpg" if jpeg else ".png", content) if not pattern else _demosaiced(content, pattern)
     raise InvalidImage(f"is neither JPEG nor PNG (format {str(image.format)[:40]!r})")
+
+
+def _bayer_pattern(kind: str) -> str:
+    """Bayer pattern of a `CompressedImage` with the `format` `kind`; "" if its pixels aren't raw.
+
+    compressed_image_transport doesn't convert Bayer images ("bayer_rggb8; jpeg compressed "), or to grey ("mono8").
+    """
+    encoding, _, stored = kind.lower().partition(";")
+    raw = encoding.startswith("bayer_") and not any(name in stored for name in ("mono", "bgr", "rgb8", "rgb16"))
+    return encoding[6:10] if (raw or "bayer_" in stored) and encoding[6:10] in BAYER else ""
+
+
+def _demosaiced(content: bytes, pattern: str) -> tuple[str, bytes]:
+    """PNG file of a compressed Bayer pattern; a file with colours is kept."""
+    import cv2
+
+    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise InvalidImage("is damaged")
+    if pixels.ndim == 3:
+        return (".jpg" if content.startswith(JPEG) else ".png"), content
+    colour = cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{BAYER[pattern]}2BGR"))
+    return ".png", cv2.imencode(".png", colour, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+
+
+def unused_bits(image: Any) -> int:
+    """Number of the highest bits that no pixel of a 16-bit `Image` uses: 4 of a 12-bit camera; 0 of other images."""
+    if not str(image.encoding).lower().endswith(("16", "16uc1", "16uc3")):
+        return 0
+    try:
+        pixels = _bgr(image)
+    except InvalidImage:
+        return 0
+    return 16 - int(pixels.max()).bit_length() if pixels.dtype == np.uint16 else 0
 
 
 def raw_file(image: Any) -> tuple[str, bytes]:

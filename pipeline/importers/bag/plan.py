@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -14,20 +14,30 @@ from scan2sim.pipeline.core.parameters import Seconds
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers.bag import contents, images
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of
+from scan2sim.pipeline.importers.bag.camera_topics import CameraTopics, base, rectified
+from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, has_only_projection, looks_rectified
+from scan2sim.pipeline.importers.bag.clocks import check_clocks
 from scan2sim.pipeline.importers.bag.contents import Contents
+from scan2sim.pipeline.importers.bag.lidar_topics import LidarTopics
 from scan2sim.pipeline.importers.bag.point_cloud2 import InvalidCloud
+from scan2sim.pipeline.importers.bag.pose_messages import (
+    fix_sigma,
+    odometry_child,
+    odometry_poses,
+    valid_fix,
+    without_orientation,
+)
 from scan2sim.pipeline.importers.bag.reader import plain
-from scan2sim.pipeline.importers.bag.transforms import WORLD_FRAMES
+from scan2sim.pipeline.importers.bag.transforms import BODY_FRAMES, WORLD_FRAMES, earth_centred, without_turns
 from scan2sim.pipeline.io import urdf as urdf_io
 from scan2sim.pipeline.io.calibration import read_camera
 
 AUTO, NONE, TF, GNSS, SWEEPS = "auto", "none", "tf", "gnss", "sweeps"
 MIN_FIX_RATE_HZ, MAX_FIX_SIGMA_M = 4.0, 0.5
 """GPS with an IMU places sweeps alone if it is at least that frequent and exact; otherwise it is fused with them."""
-BODY_FRAMES = ("base_link", "base_footprint", "base", "body")
-"""Names of the vehicle's frame (REP 105), the preferred one first."""
 NAMES_OF_IMAGES = ("image", "image_raw", "image_rect", "image_color", "image_rect_color", "image_mono", "raw")
+MIN_UNUSED_BITS = 2
+"""Highest bits of 16-bit images that aren't used, from which a warning says so."""
 URDF_TOLERANCE = 0.005
 """Difference between a link of a URDF and that of the bag that is worth a warning: metres, and rotation elements."""
 LIST_TOPICS = "`scan2sim inspect` lists its topics"
@@ -36,6 +46,8 @@ LIDAR_PACKETS = (
     "NebulaPackets", "RslidarPacket", "RslidarScan", "LslidarPacket", "LslidarScan",
 )  # fmt: skip
 """Types, without their package, of a lidar's raw packets, which only its driver can decode."""
+COMPRESSED_POINTS = "CompressedPointCloud2"
+"""End of the types of compressed points (Draco, Cloudini, zstd), of `point_cloud_transport`."""
 VIDEOS = ("CompressedVideo", "FFMPEGPacket", "theora_image_transport/msg/Packet")
 """Ends of the types of compressed videos."""
 
@@ -168,6 +180,11 @@ class _Planner:
     warnings: list[str] = field(default_factory=list)
 
     @property
+    def photos(self) -> CameraTopics:
+        """Topics of cameras."""
+        return CameraTopics(self.found, self.uses)
+
+    @property
     def path(self) -> Path:
         return self.found.bag.path
 
@@ -179,7 +196,18 @@ class _Planner:
         poses = self.poses(scanner)
         gps = self.gps(poses)
         cameras = self.cameras(scanner)
+        if self.params.stamps == "header":
+            self._check_clocks(lidars, cameras, poses, gps)
         return Plan(lidars, cameras, poses, gps, self.all_uses(), tuple(self.warnings))
+
+    def _check_clocks(
+        self, lidars: tuple[Lidar, ...], cameras: tuple[PhotoSource, ...], poses: PoseSource, gps: str
+    ) -> None:
+        others = [one.topic for one in lidars[1:]] + [one.topic for one in cameras]
+        others += filter(None, (poses.topic, poses.imu, gps))
+        frames = self.found.frames
+        above = frames.ancestors(lidars[0].frame, poses.world) if poses.kind == "tf" else []
+        check_clocks(self.found, lidars[0].topic, others, [link for link in above if link in frames.moving])
 
     def _add_urdf(self) -> None:
         """Add the fixed joints of the robot's description; links of the bag itself are kept."""
@@ -205,6 +233,9 @@ class _Planner:
             cause = f"contains no sweeps (PointCloud2 or Livox CustomMsg); its topics: {self._listed()}"
             packets = [topic for topic in self.found.bag.topics if _is_packets(self.found, topic)]
             remedy = "Record the lidar's topic, or name one with --lidar"
+            packed = [one.name for one in self.found.bag.topics.values() if one.type.endswith(COMPRESSED_POINTS)]
+            if packed:
+                remedy = f"{', '.join(packed)} has compressed points: republish them as PointCloud2 and record them"
             if packets:
                 remedy = (
                     f"{', '.join(packets)} has the lidar's raw packets: play the bag while the lidar's driver runs, "
@@ -224,46 +255,14 @@ class _Planner:
         return tuple(lidars)
 
     def _default_lidars(self) -> list[str]:
-        """One topic of each frame, the best one; that with most points first."""
-        best: dict[str, tuple[tuple[bool, int], str]] = {}
-        worlds = {parent for parent, _ in self.found.frames.moving} | set(WORLD_FRAMES)
-        for topic in self.found.topics("lidar"):
-            sweep, frame = self.found.first[topic], self.found.frame(topic)
-            samples = self.found.samples.get(topic)
-            if isinstance(sweep, InvalidCloud):
-                self.uses[topic] = f"not used: {sweep}"
-            elif frame in worlds and not self.found.bag.topics[topic].type.startswith("livox"):
-                self.uses[topic] = f"not used: in the frame {frame}, not a lidar's (--lidar uses it)"
-            elif samples and sweep.rgb is not None and samples[0].height > 1:
-                self.uses[topic] = "not used: points of a depth camera (--lidar uses it)"
-            else:
-                rank = (sweep.time is not None, len(sweep) * self.found.bag.topics[topic].count)
-                old = best.get(frame)
-                if old is not None:
-                    loser, winner = (old[1], topic) if rank > old[0] else (topic, old[1])
-                    self.uses[loser] = f"not used: of the same lidar as {winner} (--lidar uses it)"
-                if old is None or rank > old[0]:
-                    best[frame] = rank, topic
-        order = sorted(best.values(), key=lambda one: -one[0][1])
-        names = [topic for _, topic in order]
-        if not names:
-            return []
-        first, *others = names
-        usable = [first]
-        for topic in others:
-            if self.found.frames.connected(self.found.frame(first), self.found.frame(topic)):
-                usable.append(topic)
-            else:
-                missing = f"no static transform to {self.found.frame(first)!r} from {self.found.frame(topic)!r}"
-                self.uses[topic] = f"not used: {missing} (--transform adds it)"
-                self.warnings.append(f"{topic} is left out: {missing}; give it with --transform")
-        return usable
+        return LidarTopics(self.found, self.uses, self.warnings).chosen()
 
     def cameras(self, scanner: str) -> tuple[PhotoSource, ...]:
         given = self.params.camera
         if given == (NONE,):
             return ()
-        topics = [self._known(name, "--camera", "image", "compressed") for name in given] or self._default_cameras()
+        topics = [self._known(name, "--camera", "image", "compressed") for name in given]
+        topics = topics or self.photos.chosen(calibrated=self.intrinsics is not None)
         sources: list[PhotoSource] = []
         for topic in topics:
             frame = self.found.frame(topic)
@@ -274,58 +273,39 @@ class _Planner:
             T = self.found.frames.between(frame, scanner)
             sources.append(PhotoSource(topic, key, frame, camera, T))
             self.uses[topic] = f"photos; frame {frame}, {camera.model} {camera.width}x{camera.height}"
-            info = self._info(topic)
+            unused = 0 if self.found.kind(topic) == "compressed" else images.unused_bits(self.found.first[topic])
+            if unused >= MIN_UNUSED_BITS:
+                self.warnings.append(
+                    f"the first image of {topic} uses {16 - unused} of 16 bits: its photos are dark (have the driver "
+                    "publish 8 bits, or 16 bits that are shifted)"
+                )
+            info = self.photos.info(topic)
             if info is not None and self.intrinsics is None:
                 self.uses[info] = f"calibration of {topic}"
         return tuple(sources)
 
-    def _default_cameras(self) -> list[str]:
-        """One topic of each camera: with most images, with colours, not rectified, not compressed."""
-        best: dict[str, tuple[tuple[Any, ...], str]] = {}
-        for topic in self.found.topics("image", "compressed"):
-            first = self.found.first[topic]
-            encoding = str(getattr(first, "encoding", "")) or str(getattr(first, "format", ""))
-            if encoding in images.DEPTH_ENCODINGS or "compressedDepth" in (encoding, topic.rpartition("/")[2]):
-                self.uses[topic] = "not used: depth images"
-                continue
-            info = self._info(topic)
-            if info is None and self.intrinsics is None:
-                self.uses[topic] = "not used: no CameraInfo (--intrinsics gives its camera)"
-                continue
-            compressed = self.found.kind(topic) == "compressed"
-            rank = (self.found.bag.topics[topic].count, images.colours(encoding), "rect" not in topic, not compressed)
-            key = info or topic
-            old = best.get(key)
-            if old is not None:
-                loser, winner = (old[1], topic) if rank > old[0] else (topic, old[1])
-                self.uses[loser] = f"not used: of the same camera as {winner} (--camera uses it)"
-            if old is None or rank > old[0]:
-                best[key] = rank, topic
-        return sorted(topic for _, topic in best.values())
-
-    def _info(self, topic: str) -> str | None:
-        """Topic of the CameraInfo of an image topic: beside it, else the only one in its frame."""
-        base = _base(topic)
-        beside = f"{base.rpartition('/')[0]}/camera_info"
-        infos = self.found.topics("info")
-        if beside in infos:
-            return beside
-        own = [name for name in infos if self.found.frame(name) == self.found.frame(topic)]
-        return own[0] if len(own) == 1 else None
-
     def _camera(self, topic: str) -> Camera:
-        width, height = self._size(topic)
+        width, height = self.photos.size(topic)
         if self.intrinsics is not None:
             return read_camera(self.intrinsics, width, height)
-        info = self._info(topic)
-        remedy = "Give the camera with --intrinsics (a TOML file with [[cameras]] as in a tile), or --camera none"
+        info = self.photos.info(topic)
+        remedy = (
+            "Give the camera with --intrinsics (a TOML file with [[cameras]] as in a tile), or choose topics with "
+            "--camera (none: no photos)"
+        )
         if info is None:
             infos = ", ".join(self.found.topics("info")) or "none"
             raise InputError(self.path, f"has no CameraInfo of {topic} (it has {infos})", remedy)
         try:
-            camera = camera_of(self.found.first[info], rectified="rect" in _base(topic).rpartition("/")[2])
+            first = self.found.first[info]
+            camera = camera_of(first, rectified=rectified(topic) or has_only_projection(first))
         except InvalidCamera as error:
             raise InputError(self.path, f"the message of {info} {error}", remedy) from None
+        if not rectified(topic) and looks_rectified(self.found.first[info]):
+            self.warnings.append(
+                f"the images of {topic} seem to be rectified (K of {info} is off their middle, P isn't), but are taken "
+                "as raw: if they are rectified, give the camera of P with --intrinsics"
+            )
         if (camera.width, camera.height) == (width, height):
             return camera
         cause = f"the images of {topic} are {width}x{height}, those of {info} {camera.width}x{camera.height}"
@@ -333,27 +313,6 @@ class _Planner:
             raise InputError(self.path, cause, remedy)
         self.warnings.append(f"{cause}: the calibration is scaled")
         return camera.resized(width, height)
-
-    def _size(self, topic: str) -> tuple[int, int]:
-        """Width and height of a topic's images, by the first one."""
-        import cv2
-
-        first = self.found.first[topic]
-        if self.found.kind(topic) == "image":
-            if not (first.width and first.height and len(first.data)):
-                raise self._no_image(topic, "has no data")
-            return int(first.width), int(first.height)
-        try:
-            _, content = images.compressed_file(first)
-        except images.InvalidImage as error:
-            raise self._no_image(topic, str(error)) from None
-        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        if pixels is None:
-            raise self._no_image(topic, "is a damaged image")
-        return int(pixels.shape[1]), int(pixels.shape[0])
-
-    def _no_image(self, topic: str, cause: str) -> InputError:
-        return InputError(self.path, f"the first image of {topic} {cause}", "Name other topics with --camera, or none")
 
     def poses(self, scanner: str) -> PoseSource:
         """Source of the scanner's poses.
@@ -365,7 +324,13 @@ class _Planner:
         if wanted in (AUTO, TF):
             given = self.params.world_frame if wanted == TF or self.params.world_frame else None
             world = frames.world_frame(scanner, given)
+            if world is not None and wanted == AUTO and earth_centred(frames.poses_of(scanner, world)[1]):
+                self.warnings.append(f"/tf isn't used: its frame {world!r} is earth-centred, its z axis isn't up")
+                moving = [one for one in self.found.topics("tf") if not contents.is_static(one)]
+                self.uses.update(dict.fromkeys(moving, "not used: poses in an earth-centred frame"))
+                world = None
             if world is not None:
+                self._warn_parents(scanner, world)
                 for topic in self.found.topics("tf"):
                     if not contents.is_static(topic):
                         self.uses[topic] = f"poses of {scanner} in {world}"
@@ -389,6 +354,17 @@ class _Planner:
             return PoseSource("odometry", topic, child)
         return PoseSource("sweeps")
 
+    def _warn_parents(self, scanner: str, world: str) -> None:
+        """Warn of frames above the scanner that have several parents, as with two odometries at once."""
+        frames = self.found.frames
+        for parent, child in frames.ancestors(scanner, world):
+            others = [name for name in frames.parents(child) if name != parent and (name, child) in frames.moving]
+            if others:
+                listed = ", ".join(map(repr, others))
+                self.warnings.append(
+                    f"{child!r} has several parents in /tf: {parent!r} is used, not {listed} (--world-frame)"
+                )
+
     def child(self, topic: str) -> str:
         """Frame whose pose an odometry gives."""
         return odometry_child(self.found.first[topic])
@@ -411,10 +387,17 @@ class _Planner:
             return place, -self.found.bag.topics[topic].count
 
         frames = self.found.frames
-        own = [topic for topic in self.found.topics("odometry") if frames.connected(self.child(topic), scanner)]
+        own = []
         for topic in self.found.topics("odometry"):
-            if topic not in own:
+            T = odometry_poses(self.found.samples.get(topic, []))
+            if not frames.connected(self.child(topic), scanner):
                 self.uses[topic] = f"not used: no static transform from {self.child(topic)!r} to {scanner!r}"
+            elif earth_centred(T):
+                self.uses[topic] = "not used: poses in an earth-centred frame, whose z axis isn't up"
+            elif without_turns(T):
+                self.uses[topic] = "not used: positions without orientations"
+            else:
+                own.append(topic)
         if not own:
             return None
         best = min(own, key=rank)
@@ -423,7 +406,9 @@ class _Planner:
     def _gnss(self, scanner: str, required: bool) -> PoseSource | None:
         """Satellite positions with an IMU's orientation; None if they are too rare or inexact for it."""
         fixes, imus, frames = self.found.topics("fix"), self.found.topics("imu"), self.found.frames
-        oriented = [topic for topic in imus if has_orientation(self.found.first[topic])]
+        samples = self.found.samples
+        oriented = [name for name in imus if not without_orientation(samples.get(name) or [self.found.first[name]])]
+        self.uses.update({name: "not used: has no orientations" for name in imus if name not in oriented})
         usable = [topic for topic in oriented if frames.connected(self.found.frame(topic), scanner)]
         if required:
             for kind, names in (("NavSatFix", fixes), ("Imu with an orientation", oriented)):
@@ -435,12 +420,15 @@ class _Planner:
         if not fixes or not usable:
             return None
         fix = self._best_fix()
-        samples = self.found.samples.get(fix, [])
-        sigmas = [fix_sigma(sample) for sample in samples]
-        known = [sigma for sigma in sigmas if sigma is not None]
-        exact = not known or float(np.median(known)) <= MAX_FIX_SIGMA_M
-        if not required and not (contents.rate(samples) >= MIN_FIX_RATE_HZ and exact):
+        sigma = self._sigma(fix)
+        exact = sigma is None or sigma <= MAX_FIX_SIGMA_M
+        if not required and not (contents.rate(self.found.samples.get(fix, [])) >= MIN_FIX_RATE_HZ and exact):
             return None
+        if sigma is None:
+            self.warnings.append(
+                f"{fix} has no covariances: its fixes are taken to be exact to {MAX_FIX_SIGMA_M:g} m, as with RTK; "
+                "if they aren't, use --poses sweeps, which fuses them with lidar odometry"
+            )
         imu = max(usable, key=lambda topic: self.found.bag.topics[topic].count)
         receiver, body = self.found.frame(fix), self.found.frame(imu)
         if receiver != body and not frames.connected(body, receiver):
@@ -450,7 +438,20 @@ class _Planner:
         return PoseSource("gnss", fix, imu=imu, frames=(receiver, body))
 
     def _best_fix(self) -> str:
-        return max(self.found.topics("fix"), key=lambda topic: self.found.bag.topics[topic].count)
+        """The receiver with valid fixes, if possible exact ones, and with most of them."""
+
+        def rank(topic: str) -> tuple[bool, bool, int]:
+            sigma = self._sigma(topic)
+            valid = any(valid_fix(fix) for fix in self.found.samples.get(topic, []))
+            return valid, sigma is not None and sigma <= MAX_FIX_SIGMA_M, self.found.bag.topics[topic].count
+
+        return max(self.found.topics("fix"), key=rank)
+
+    def _sigma(self, topic: str) -> float | None:
+        """Median standard deviation of the first seconds' valid fixes, metres; None if it is unknown."""
+        fixes = [fix for fix in self.found.samples.get(topic, []) if valid_fix(fix)]
+        known = [sigma for fix in fixes if (sigma := fix_sigma(fix)) is not None]
+        return float(np.median(known)) if known else None
 
     def gps(self, poses: PoseSource) -> str:
         """Topic of fixes to fuse with lidar odometry; "" for none."""
@@ -494,13 +495,22 @@ def plan_import(found: Contents, params: BagParams, intrinsics: Path | None = No
     return _Planner(found, params, intrinsics, urdf).plan()
 
 
-def described(found: Contents, params: BagParams, urdf: Path | None = None) -> tuple[dict[str, str], ScanError | None]:
-    """What each topic would be used for, and the error that would stop an import, or None."""
+class Description(NamedTuple):
+    """What each topic would be used for, warnings, and the error that would stop an import, or None."""
+
+    uses: dict[str, str]
+    warnings: tuple[str, ...]
+    error: ScanError | None
+
+
+def described(found: Contents, params: BagParams, urdf: Path | None = None) -> Description:
+    """What an import would do."""
     planner = _Planner(found, params, None, urdf)
     try:
-        return planner.plan().uses, None
+        plan = planner.plan()
     except ScanError as error:
-        return planner.all_uses(), error
+        return Description(planner.all_uses(), tuple(planner.warnings), error)
+    return Description(plan.uses, plan.warnings, None)
 
 
 def resolved(params: BagParams, plan: Plan) -> BagParams:
@@ -513,32 +523,14 @@ def resolved(params: BagParams, plan: Plan) -> BagParams:
     return params.model_copy(update=changed)
 
 
-def odometry_child(message: Any) -> str:
-    """Frame whose pose an Odometry message gives; base_link if it doesn't say."""
-    return str(message.child_frame_id).lstrip("/") or "base_link"
-
-
-def has_orientation(imu: Any) -> bool:
-    """Whether an Imu message has an orientation (REP 145: a covariance of -1 means it has none)."""
-    q = imu.orientation
-    length = float(np.linalg.norm([q.x, q.y, q.z, q.w]))
-    return float(imu.orientation_covariance[0]) != -1 and abs(length - 1) < 0.1
-
-
-def fix_sigma(fix: Any) -> float | None:
-    """Horizontal standard deviation of a NavSatFix in metres, or None if it is unknown."""
-    if int(fix.position_covariance_type) == 0:
-        return None
-    variance = (float(fix.position_covariance[0]) + float(fix.position_covariance[4])) / 2
-    return float(np.sqrt(max(0.0, variance)))
-
-
 def _unused(found: Contents, topic: str) -> str:
     """Text about a topic that isn't used."""
     if found.kind(topic) == "tf" and contents.is_static(topic):
         return "transforms between frames"
     if _is_packets(found, topic):
         return "not used: raw packets of a lidar, whose driver makes PointCloud2 of them"
+    if found.bag.topics[topic].type.endswith(COMPRESSED_POINTS):
+        return "not used: compressed points (republish them as PointCloud2 with point_cloud_transport)"
     if found.bag.topics[topic].type.endswith(VIDEOS):
         return "not used: compressed video (republish it as CompressedImage)"
     reasons = {"info": ": its images aren't", "": ": of no kind that the import reads", "pose": " (--poses uses it)"}
@@ -550,14 +542,9 @@ def _is_packets(found: Contents, topic: str) -> bool:
     return found.bag.topics[topic].type.rpartition("/")[2] in LIDAR_PACKETS
 
 
-def _base(topic: str) -> str:
-    """Topic of the images without the suffix of its transport."""
-    return topic.removesuffix("/compressed")
-
-
 def _id(topic: str) -> str:
     """Name of a camera after its topic: /front/image_raw/compressed becomes "front"."""
-    parts = [part for part in _base(topic).split("/") if part]
+    parts = [part for part in base(topic).split("/") if part]
     while len(parts) > 1 and parts[-1] in NAMES_OF_IMAGES:
         parts.pop()
     return "_".join(parts) or "camera"

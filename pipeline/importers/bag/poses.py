@@ -10,13 +10,24 @@ from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.poses import interpolate
 from scan2sim.pipeline.core.types import F64, Trajectory
 from scan2sim.pipeline.importers.bag.contents import Contents, add_transforms, is_static
-from scan2sim.pipeline.importers.bag.plan import Plan, fix_sigma, has_orientation
+from scan2sim.pipeline.importers.bag.plan import Plan
+from scan2sim.pipeline.importers.bag.pose_messages import fix_sigma, has_orientation, valid_fix
 from scan2sim.pipeline.importers.bag.reader import Bag, Message
-from scan2sim.pipeline.importers.bag.transforms import Frames, Series, pose_matrix
+from scan2sim.pipeline.importers.bag.transforms import (
+    BODY_FRAMES,
+    Frames,
+    Series,
+    earth_centred,
+    in_gap,
+    pose_matrix,
+    without_turns,
+)
 from scan2sim.pipeline.io.geodata import crs as crs_io
 
 MIN_POSE_INTERVAL_S = 0.0099
 """Poses of an IMU are thinned to a hundred per second."""
+HEADING_STEP_M, MIN_HEADING_STEPS, MAX_HEADING_ERROR_DEG = 2.0, 3, 30.0
+"""Length and least number of the pieces of a path by which headings are checked, and the reported difference."""
 GPS_HEADER = "time,latitude,longitude,altitude,accuracy"
 
 
@@ -30,6 +41,7 @@ class PoseMessages:
         frames: static transforms, and those that are gathered.
         log_times: take the times at which messages were recorded.
         links: links of /tf that are needed: those above the scanner.
+        warnings: of `trajectory`.
     """
 
     bag: Bag
@@ -37,6 +49,7 @@ class PoseMessages:
     frames: Frames
     log_times: bool
     links: frozenset[tuple[str, str]]
+    warnings: list[str] = field(default_factory=list)
     _odometry: Series = field(default_factory=Series)
     _fixes: list[tuple[float, ...]] = field(default_factory=list)
     _imu: list[tuple[float, ...]] = field(default_factory=list)
@@ -44,7 +57,7 @@ class PoseMessages:
     @staticmethod
     def of(found: Contents, plan: Plan, log_times: bool) -> PoseMessages:
         """An object with the static transforms of a bag, without poses."""
-        above = frozenset(found.frames.ancestors(plan.lidars[0].frame))
+        above = frozenset(found.frames.ancestors(plan.lidars[0].frame, plan.poses.world or None))
         return PoseMessages(found.bag, plan, Frames(found.bag.path, dict(found.frames.static)), log_times, above)
 
     @property
@@ -86,9 +99,8 @@ class PoseMessages:
 
     def _add_fix(self, message: Message) -> None:
         fix = self.bag.decode(message)
-        position = (float(fix.latitude), float(fix.longitude), float(fix.altitude))
-        if int(fix.status.status) >= 0 and np.isfinite(position).all() and abs(position[0]) <= 84:
-            sigma = fix_sigma(fix)
+        if valid_fix(fix):
+            position, sigma = (float(fix.latitude), float(fix.longitude), float(fix.altitude)), fix_sigma(fix)
             self._fixes.append((self._time(message), *position, np.nan if sigma is None else sigma))
 
     def fixes(self) -> F64:
@@ -123,6 +135,11 @@ class PoseMessages:
             times, T = self.frames.poses_of(scanner, self.plan.poses.world)
         elif kind == "odometry":
             times, T = self._odometry.sorted()
+            if without_turns(T):
+                cause = (
+                    f"has positions without orientations in {self.plan.poses.topic}: they never change while it moves"
+                )
+                raise InputError(self.bag.path, cause, "Use other --poses (sweeps needs none)")
             if len(times):
                 T = T @ self.frames.between(self.plan.poses.child, scanner)
         else:
@@ -130,6 +147,12 @@ class PoseMessages:
         if len(times) < 2:
             remedy = "Use other --poses (sweeps needs none), or check the recording"
             raise DataError(self.bag.path, f"has {len(times)} poses of the frame {scanner!r}", remedy)
+        if earth_centred(T):
+            source = self.plan.poses.topic or f"the frame {self.plan.poses.world!r}"
+            cause = f"has poses in an earth-centred frame (ECEF), whose z axis isn't up, in {source}"
+            raise InputError(
+                self.bag.path, cause, "Use another --poses or --world-frame: a local frame (ENU, map, odom)"
+            )
         return Trajectory(times, T[:, :3, 3], T[:, :3, :3])
 
     def _satellite_poses(self, scanner: str) -> tuple[F64, F64]:
@@ -151,6 +174,9 @@ class PoseMessages:
             times = fixes[(fixes[:, 0] >= rows[0, 0]) & (fixes[:, 0] <= rows[-1, 0]), 0]
         if not len(times):
             return times, np.zeros((0, 4, 4))
+        times = self._without_gaps(times, fixes[:, 0], rows[:, 0])
+        if not len(times):
+            return times, np.zeros((0, 4, 4))
         turns = np.tile(np.eye(4), (len(rows), 1, 1))
         turns[:, :3, :3] = Rotation.from_quat(rows[:, 1:]).as_matrix()
         # true north to grid north
@@ -162,7 +188,47 @@ class PoseMessages:
         if imu != receiver and self.frames.connected(imu, receiver):
             lever = self.frames.between(imu, receiver)[:3, 3]
             T[:, :3, 3] -= T[:, :3, :3] @ lever
+        self._warn_heading(T, imu)
         return times, T @ self.frames.between(imu, scanner)
+
+    def _without_gaps(self, times: F64, *sources: F64) -> F64:
+        """Times (N,) that aren't in a gap of one of the ascending times of messages."""
+        keep = np.logical_and.reduce([~in_gap(at, times) for at in sources])
+        if not keep.all():
+            self.warnings.append(
+                f"{100 * (1 - keep.mean()):.0f} % of the drive have no valid fixes or orientations: they are left out "
+                "(--poses sweeps bridges gaps with lidar odometry)"
+            )
+        return times[keep]
+
+    def _warn_heading(self, T_world_imu: F64, imu: str) -> None:
+        """Warn if the vehicle doesn't move along its x axis: the IMU's orientation is of another convention."""
+        body = next((name for name in BODY_FRAMES if self.frames.connected(imu, name)), None)
+        error = None if body is None else heading_error(T_world_imu @ self.frames.between(imu, body))
+        if error is not None and error > MAX_HEADING_ERROR_DEG:
+            topic = self.plan.poses.imu
+            self.warnings.append(
+                f"the orientation of {topic} is {error:.0f} degrees off the direction of travel: it must be "
+                "in east, north, up (REP 103), not in north, east, down, to magnetic north, or relative to its start; "
+                "compare with --poses sweeps"
+            )
+
+
+def heading_error(T: F64) -> float | None:
+    """Median angle (degrees, 0 to 90) between x axis and motion, forward or backward, of poses (N, 4, 4) of a vehicle.
+
+    None if it moves too little.
+    """
+    kept = [0]
+    for i in range(len(T)):
+        if np.linalg.norm(T[i, :2, 3] - T[kept[-1], :2, 3]) >= HEADING_STEP_M:
+            kept.append(i)
+    if len(kept) <= MIN_HEADING_STEPS:
+        return None
+    move = np.diff(T[kept, :2, 3], axis=0)
+    axis = T[kept[:-1], :2, 0] + T[kept[1:], :2, 0]
+    cross = np.abs(axis[:, 0] * move[:, 1] - axis[:, 1] * move[:, 0])
+    return float(np.median(np.degrees(np.arctan2(cross, np.abs((axis * move).sum(axis=1))))))
 
 
 def crs_of(found: Contents, plan: Plan) -> str | None:
@@ -176,6 +242,6 @@ def crs_of(found: Contents, plan: Plan) -> str | None:
         return None
     for message in found.bag.messages([topic]):
         fix = found.bag.decode(message)
-        if int(fix.status.status) >= 0 and np.isfinite([fix.latitude, fix.longitude, fix.altitude]).all():
+        if valid_fix(fix):
             return crs_io.utm(float(fix.latitude), float(fix.longitude))
     raise InputError(found.bag.path, f"{topic} has no valid fix", "Use --gps none, or other --poses")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import errno
+import re
 import struct
 import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 from urllib.parse import unquote
 
@@ -25,6 +26,11 @@ REPAIR = {
     "": "If the recording was interrupted, run `ros2 bag reindex` on the folder; otherwise copy it again",
 }
 """Remedy for a bag that can't be read, by suffix; "" for a folder."""
+MCAP_MAGIC, MCAP_HEAD_BYTES = b"\x89MCAP0\r\n", 512
+"""Beginning of an MCAP file; a record with its length (9 bytes), and the length of the profile's name (4) follow."""
+COMPRESSION_MODE = re.compile(r"^ *compression_mode:[ ]*(\S*)", re.MULTILINE)
+LISTED_FILES = re.compile(r"^ *relative_file_paths: *\n((?: *- *\S.*\n)+)", re.MULTILINE)
+"""Fields of a metadata.yaml: how the files are compressed, and their paths, one a line."""
 EXPECTED = "Give an .mcap, .db3 or .bag file, or the folder of a bag with its metadata.yaml"
 
 
@@ -167,6 +173,8 @@ def opened(path: Path) -> Iterator[Bag]:
     paths = _paths(path)
     for one in paths:
         _check_name(one)
+        _check_log(one)
+        _check_profile(one)
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -207,7 +215,7 @@ def _files(folder: Path) -> list[Path]:
 def _paths(path: Path) -> list[Path]:
     if path.is_dir():
         if (path / METADATA).is_file():
-            return [path]
+            return _listed(path) or [path]
         files = _files(path)
         if not files:
             raise InputError(path, "contains no bag (no metadata.yaml, .mcap, .db3 or .bag)", EXPECTED)
@@ -220,6 +228,54 @@ def _paths(path: Path) -> list[Path]:
     if path.stat().st_size == 0:
         raise InputError(path, "is an empty file", _repair(path))
     return [path]
+
+
+def _listed(folder: Path) -> list[Path]:
+    """Files of an uncompressed bag that its metadata.yaml lists; empty if they aren't readable without it.
+
+    The files have all that is needed; `ros2 bag reindex` writes metadata that contradict them (no storage, other QoS).
+    """
+    try:
+        text = (folder / METADATA).read_text(encoding="utf-8", errors="replace")
+    except OSError:  # the library's error names it
+        return []
+    mode, listed = COMPRESSION_MODE.search(text), LISTED_FILES.search(text)
+    if listed is None or (mode is not None and mode[1].strip("'\"").lower() not in ("", "none")):
+        return []
+    names = [line.strip().removeprefix("-").strip().strip("'\"") for line in listed[1].splitlines()]
+    files = [folder / PurePath(name).name for name in names]
+    return (
+        files if all(file.is_file() and file.suffix in SUFFIXES[:2] and file.stat().st_size for file in files) else []
+    )
+
+
+def _check_log(path: Path) -> None:
+    """Check that an SQLite file has all its messages: after a crash, some may still be in its write-ahead log."""
+    for file in path.glob("*.db3") if path.is_dir() else [path]:
+        log = file.with_name(f"{file.name}-wal")
+        if file.suffix == ".db3" and log.is_file() and log.stat().st_size:
+            cause = f"is incomplete: messages are still in {log.name}, as the recording was interrupted"
+            raise InputError(
+                file, cause, f"Write them into the file: sqlite3 {file.name} 'PRAGMA wal_checkpoint(TRUNCATE)'"
+            )
+
+
+def _check_profile(path: Path) -> None:
+    """Check that an MCAP file contains messages of ROS 2: other programs write the same format."""
+    if path.suffix != ".mcap":
+        return
+    with open(path, "rb") as file:
+        head = file.read(MCAP_HEAD_BYTES)
+    if not head.startswith(MCAP_MAGIC) or len(head) < len(MCAP_MAGIC) + 13:
+        return
+    start, length = len(MCAP_MAGIC) + 13, int.from_bytes(head[len(MCAP_MAGIC) + 9 : len(MCAP_MAGIC) + 13], "little")
+    profile = head[start : start + length].decode(errors="replace")
+    if profile == "ros1":
+        remedy = "Give the .bag file that it was converted from, or convert it back"
+    else:
+        remedy = "Convert it to a ROS 2 bag with sensor_msgs (Foxglove's own schemas and Protobuf aren't read)"
+    if profile != "ros2":
+        raise InputError(path, f"is an MCAP file without ROS 2 messages (profile {profile[:40]!r})", remedy)
 
 
 def _check_name(path: Path) -> None:

@@ -12,16 +12,72 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.poses import interpolate
-from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.core.types import F64, Bools
 from scan2sim.pipeline.importers.bag.reader import plain
 
 WORLD_FRAMES = ("map", "world", "odom", "earth")
 """Names of frames that don't move with the vehicle (REP 105), the preferred one first."""
+BODY_FRAMES = ("base_link", "base_footprint", "base", "body")
+"""Names of the vehicle's frame (REP 105), the preferred one first."""
 CONSTANT = 1e-6
 """Largest change of a transform that never changes: metres, and elements of the rotation matrix."""
+EARTH_RADII_M, MAX_HEIGHT_M = (6.33e6, 6.42e6), 12_000.0
+"""Distances of the ground from the earth's centre; coordinates of projections have heights below the second number."""
+MIN_SIDEWAYS = 0.2
+"""Extent of a path across its main direction, as a share of that along it, that a vehicle needs turns for."""
+MAX_STEP_S, STEP_RATIO = 2.0, 5.0
+"""A longer time without messages than both, seconds and times the usual interval, is a gap."""
+MAX_SHIFT_M, MIN_SPEED_MS = 1.0, 0.1
+"""A link that changes by more than that during a gap moved; a link that is faster on average is that of a vehicle."""
 MAX_LISTED = 20
 """Links that an error lists."""
 GIVE_LINK = "Give the transform with --transform 'PARENT CHILD x y z qx qy qz qw', or the robot's --urdf"
+
+
+def earth_centred(T: F64) -> bool:
+    """Whether poses (N, 4, 4) are in an earth-centred frame (ECEF), whose z axis isn't up."""
+    if not len(T):
+        return False
+    middle = np.median(T[:, :3, 3], axis=0)
+    return bool(EARTH_RADII_M[0] < np.linalg.norm(middle) < EARTH_RADII_M[1] and abs(middle[2]) > MAX_HEIGHT_M)
+
+
+def without_turns(T: F64) -> bool:
+    """Whether poses (N, 4, 4) are positions without orientations: they move along two axes and never turn."""
+    if len(T) < 3 or np.ptp(T[:, :3, :3], axis=0).max() > CONSTANT:
+        return False
+    less, more = sorted(np.ptp((T[:, :3, 3] - T[0, :3, 3]) @ T[0, :3, :3], axis=0)[:2])
+    return bool(less > MIN_SIDEWAYS * max(more, 1e-3))
+
+
+def in_gap(at: F64, times: F64) -> Bools:
+    """Whether times (N,) are in a gap between the ascending times `at` (T,) of messages."""
+    steps = np.diff(at)
+    if not len(steps):
+        return np.zeros(len(times), bool)
+    before = np.clip(np.searchsorted(at, times) - 1, 0, len(steps) - 1)
+    return np.asarray((steps[before] > _longest_step(steps)) & (times > at[before]) & (times < at[before + 1]))
+
+
+def covered(at: F64, poses: F64, times: F64) -> Bools:
+    """Whether a link with `poses` (T, 4, 4) at ascending times `at` (T,) is known at `times` (N,).
+
+    It isn't in a gap during which it moved, and, if it moves at all, far before the first pose or after the last one:
+    corrections of an odometry may be rare, the poses of a vehicle may not.
+    """
+    steps, shifts = np.diff(at), np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    if not len(steps):
+        return np.ones(len(times), bool)
+    before = np.clip(np.searchsorted(at, times) - 1, 0, len(steps) - 1)
+    gap = in_gap(at, times) & (shifts[before] > MAX_SHIFT_M)
+    moves = shifts.sum() > MIN_SPEED_MS * (at[-1] - at[0])
+    beyond = np.maximum(at[0] - times, times - at[-1]) > _longest_step(steps)
+    return np.asarray(~gap & ~(moves & beyond))
+
+
+def _longest_step(steps: F64) -> float:
+    """Seconds between messages up to which poses are interpolated."""
+    return max(MAX_STEP_S, STEP_RATIO * float(np.median(steps)))
 
 
 def matrix(position: Any, quaternion: Any) -> F64:
@@ -57,6 +113,9 @@ class Series:
 
     def __init__(self) -> None:
         self._times, self._rows = array("d"), array("d")
+
+    def __len__(self) -> int:
+        return len(self._times)
 
     def add(self, time: float, pose: F64) -> None:
         """Add a pose (4, 4)."""
@@ -139,14 +198,30 @@ class Frames:
                         queue.append(other)
         return reached.get(target)
 
-    def ancestors(self, frame: str) -> list[tuple[str, str]]:
-        """Links from a frame up to the root of its tree, the nearest first."""
-        parents = {child: parent for parent, child in [*self.static, *self.moving]}
-        chain: list[tuple[str, str]] = []
-        while frame in parents and len(chain) <= len(parents):
-            chain.append((parents[frame], frame))
-            frame = parents[frame]
-        return chain
+    def parents(self, frame: str) -> list[str]:
+        """Parents of a frame: one in a valid tree; those with most moving transforms first."""
+        links = [link for link in dict.fromkeys([*self.moving, *self.static]) if link[1] == frame]
+        return [parent for parent, _ in sorted(links, key=lambda link: -len(self.moving.get(link, ())))]
+
+    def ancestors(self, frame: str, world: str | None = None) -> list[tuple[str, str]]:
+        """Links from a frame up to `world`, or to the root of its tree, the nearest first.
+
+        Of several parents, the one that leads to `world` counts, else to one of `WORLD_FRAMES`, else the first.
+        """
+        chains, queue = list[list[tuple[str, str]]](), [[(parent, frame)] for parent in self.parents(frame)]
+        while queue:
+            chain = queue.pop(0)
+            top, below = chain[-1][0], {child for _, child in chain}
+            above = [] if top == world else [parent for parent in self.parents(top) if parent not in below]
+            queue += [[*chain, (parent, top)] for parent in above]
+            if not above:
+                chains.append(chain)
+
+        def rank(chain: list[tuple[str, str]]) -> int:
+            names = [world, *WORLD_FRAMES]
+            return min((names.index(parent) for parent, _ in chain if parent in names), default=len(names))
+
+        return min(chains, key=rank, default=[])
 
     def world_frame(self, frame: str, given: str | None = None) -> str | None:
         """Frame above `frame` that it moves in: the given one, else one of `WORLD_FRAMES`, else the root; or None.
@@ -155,7 +230,7 @@ class Frames:
             InputError: the given one isn't above `frame`, or nothing moves between them.
         """
         above, moves = [], False
-        for link in self.ancestors(frame):
+        for link in self.ancestors(frame, None if given is None else plain(given)):
             moves = moves or link in self.moving
             if moves:
                 above.append(link[0])
@@ -167,14 +242,15 @@ class Frames:
         return next((name for name in WORLD_FRAMES if name in above), above[-1] if above else None)
 
     def poses_of(self, frame: str, world: str) -> tuple[F64, F64]:
-        """Times (T,) and poses (T, 4, 4) of a frame in a frame above it, at the times of its most frequent link."""
-        links = []
-        for link in self.ancestors(frame):
-            links.append(link)
-            if link[0] == world:
-                break
+        """Times (T,) and poses (T, 4, 4) of a frame in a frame above it, at the times of its most frequent link.
+
+        Times in a gap of another link that moved meanwhile are left out.
+        """
+        links = self.ancestors(frame, world)
         series = {link: self.moving[link].sorted() for link in links if link in self.moving}
         times = max((times for times, _ in series.values()), key=len)
+        others = [covered(at, poses, times) for at, poses in series.values() if at is not times]
+        times = times[np.logical_and.reduce([np.ones(len(times), bool), *others])]
         T = np.tile(np.eye(4), (len(times), 1, 1))
         for link in reversed(links):
             if link in series:

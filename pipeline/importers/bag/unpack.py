@@ -35,6 +35,8 @@ MAX_CLOCK_STEP_S = 10.0
 """Largest change of the difference between a sensor's clock and that of the recorder."""
 MAX_BACK_S = 1.0
 """Messages may be recorded out of order by less than this."""
+MAX_AFTER_S = 0.03
+"""Points that are later than the recording of their message by more than this have wrong times."""
 MERGE_WINDOW_NS = 500_000_000
 """Sweeps of several lidars are merged with the nearest of the first lidar within this time."""
 
@@ -111,11 +113,20 @@ class _LidarDecoder:
     """Decodes sweeps of one lidar; the unit of its times and intensities is recognized by its first sweeps."""
 
     lidar: Lidar
+    log_times: bool
     unit: TimeUnit | None = None
     scale: float | None = None
+    _after: list[float] = field(default_factory=list)
 
-    def sweep(self, raw: RawSweep, time_ns: int, stamp_ns: int, timed: bool) -> Sweep:
+    def sweep(self, raw: RawSweep, message: Message, time_ns: int, stamp_ns: int, timed: bool) -> Sweep:
         """The sweep in the axes of the first lidar, its points' times in the clock of `time_ns`.
+
+        Args:
+            raw: the points.
+            message: that of the points.
+            time_ns: its time.
+            stamp_ns: time stamp of its header.
+            timed: whether the sweeps have times of points.
 
         Raises:
             InvalidCloud: times of points are far from that of the message.
@@ -140,12 +151,22 @@ class _LidarDecoder:
             farthest = float(np.abs(offsets).max())
             if farthest >= MAX_OFFSET_S:
                 raise InvalidCloud(f"has points whose times are {farthest:.1f} s from that of the message")
+            if self.log_times:
+                offsets -= offsets.max()  # a message is recorded after its last point
             times = time_ns * 1e-9 + offsets
+            delay = (message.log_ns - stamp_ns) * 1e-9
+            if 0 < delay < MAX_OFFSET_S and not self.log_times:  # 0: of a converted bag
+                self._after.append(float(offsets.max()) - delay)
         return Sweep(xyz, intensity, raw.rgb, times)
 
     def warnings(self) -> list[str]:
         """Assumptions about the times of points."""
         topic = self.lidar.topic
+        if self._after and float(np.median(self._after)) > MAX_AFTER_S:
+            return [
+                f"the last points of {topic} are {np.median(self._after):.2f} s later than the recording of their "
+                "message: its time stamp is probably that of the end of the sweep, or its clock is wrong"
+            ]
         if self.lidar.timed and self.unit is None:
             return [f"the times of the points of {topic} have no plausible unit: they are not used"]
         if self.unit is not None and self.unit.other_clock:
@@ -246,7 +267,7 @@ def unpack(
             warn(text)
         log_times = params.stamps == "log"
         poses = PoseMessages.of(found, plan, log_times)
-        lidars = {lidar.topic: _LidarDecoder(lidar) for lidar in plan.lidars}
+        lidars = {lidar.topic: _LidarDecoder(lidar, log_times) for lidar in plan.lidars}
         cameras = {source.topic: source for source in plan.cameras}
         clocks = {topic: _Clock(bag, log_times) for topic in (*lidars, *cameras)}
         skipped, last_photo = _Skipped(), dict[str, int]()
@@ -272,7 +293,7 @@ def unpack(
                     raw = decode_sweep(bag, message)
                     if not len(raw):
                         raise InvalidCloud("has no points")
-                    sweep = lidars[message.topic].sweep(raw, time, bag.header(message).stamp_ns, plan.timed)
+                    sweep = lidars[message.topic].sweep(raw, message, time, bag.header(message).stamp_ns, plan.timed)
                     writer.add(time, sweep, message.topic == plan.lidars[0].topic)
                 elif time - last_photo.get(message.topic, time - interval) >= interval:
                     _write_photo(bag, message, cameras[message.topic], out / "photos", time)
@@ -300,10 +321,10 @@ def unpack(
             "sweeps": len(writer.times), "points": writer.points, "photos": sum(counts.values()),
             "seconds": round((max(writer.times) - min(writer.times)) / 1e9, 3), "poses": plan.poses.setting,
         }  # fmt: skip
-        return Unpacked(
-            out / "sweeps", _rig(out / "photos", kept), _poses(poses, plan.poses.kind, out), _gps(poses, plan.gps, out),
-            metrics,
-        )  # fmt: skip
+        trajectory, gps = _poses(poses, plan.poses.kind, out), _gps(poses, plan.gps, out)
+        for text in poses.warnings:
+            warn(text)
+        return Unpacked(out / "sweeps", _rig(out / "photos", kept), trajectory, gps, metrics)
 
 
 def _write_photo(bag: Bag, message: Message, source: PhotoSource, folder: Path, time_ns: int) -> None:

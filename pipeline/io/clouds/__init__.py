@@ -16,7 +16,7 @@ from scan2sim.pipeline.core import classes, plugins
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
-from scan2sim.pipeline.io import file_checks, mesh_files
+from scan2sim.pipeline.io import file_checks, foreign_files, mesh_files
 from scan2sim.pipeline.io.point_chunks import all_withheld
 
 CHUNK_POINTS = 2_000_000
@@ -30,7 +30,7 @@ SIGNATURES = {
     b"ASTM-E57": (".e57", "e57"),
 }
 """First bytes of cloud files: suffix and format."""
-SUPPORTED_FORMATS = "LAS, LAZ, COPC, PLY, E57, PCD, XYZ (.xyz .csv .txt .asc) or EPT (its ept.json)"
+SUPPORTED_FORMATS = "LAS, LAZ, COPC, PLY, E57, PCD, PTX, XYZ (.xyz .csv .txt .asc .pts) or EPT (its ept.json)"
 
 UNREADABLE_CRS = "its CRS can't be read"
 """Beginning of the note on a CRS that counts as none."""
@@ -91,7 +91,8 @@ def _reader(path: Path) -> Any:
         raise InputError(path, "is a mesh, not a point cloud", remedy)
     if name is None:
         cause = f"has an unknown cloud format ({path.suffix or 'no suffix'})"
-        raise InputError(path, cause, f"Use {SUPPORTED_FORMATS}")
+        meshes = ", ".join(mesh_files.SUFFIXES)
+        raise foreign_files.unread(path, cause, f"Use {SUPPORTED_FORMATS}; meshes ({meshes}) by scan2sim import map")
     file_checks.check_data(path)
     _check_suffix(path, name)
     reader = plugins.module(__name__, name)

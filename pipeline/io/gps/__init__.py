@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Protocol
 
 from scan2sim.pipeline.core import plugins
-from scan2sim.pipeline.core.errors import InputError, from_os_error
+from scan2sim.pipeline.core.errors import from_os_error
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import GpsTrack
-from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io import file_checks, foreign_files
 
 
 class Format(Protocol):
@@ -54,7 +54,7 @@ def reader(path: Path) -> Format:
     formats = plugins.by_suffix(__name__)
     name = formats.get(path.suffix.lower())
     if name is None:
-        raise InputError(path, "has an unknown GPS format", f"Use one of {', '.join(formats)}")
+        raise foreign_files.unread(path, "has an unknown GPS format", f"Use one of {', '.join(formats)}")
     file_checks.check(path)
     found: Format = plugins.module(__name__, name)
     require(str(path), *plugins.needs(found))

@@ -7,6 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from scan2sim.pipeline.io.images.decoders import heif
+
 GPS, EXIF = 0x8825, 0x8769  # tags of the two sub-directories (IFD)
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = 1, 2, 3, 4, 5, 6
 FOCAL, FOCAL_35MM, ORIGINAL_WIDTH, FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 37386, 41989, 40962, 41486, 41488
@@ -16,12 +18,18 @@ UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
 """Millimetres of the units in which EXIF gives the resolution of the focal plane."""
 
 
-def gps_position(photo: Path) -> tuple[float, float, float | None] | None:
-    """Latitude and longitude (degrees), altitude (m, None if unknown); None without a usable position."""
+def _opened(photo: Path) -> Any:
     from PIL import Image
 
+    if photo.suffix.lower() in heif.SUFFIXES:
+        heif.register()
+    return Image.open(photo)
+
+
+def gps_position(photo: Path) -> tuple[float, float, float | None] | None:
+    """Latitude and longitude (degrees), altitude (m, None if unknown); None without a usable position."""
     try:
-        with Image.open(photo) as image:
+        with _opened(photo) as image:
             tags = image.getexif().get_ifd(GPS)
         latitude = _degrees(tags[LATITUDE]) * (-1 if str(tags.get(LATITUDE_REF, "N")).upper().startswith("S") else 1)
         longitude = _degrees(tags[LONGITUDE]) * (-1 if str(tags.get(LONGITUDE_REF, "E")).upper().startswith("W") else 1)
@@ -35,10 +43,8 @@ def gps_position(photo: Path) -> tuple[float, float, float | None] | None:
 
 def focal_35mm(photo: Path) -> float | None:
     """35 mm equivalent focal length (mm), by the diagonal of 36 x 24 mm; None if EXIF doesn't have it."""
-    from PIL import Image
-
     try:
-        with Image.open(photo) as image:
+        with _opened(photo) as image:
             tags, size = image.getexif().get_ifd(EXIF), image.size
         focal = float(tags.get(FOCAL_35MM, 0))
         if not focal:
@@ -53,10 +59,8 @@ def focal_35mm(photo: Path) -> float | None:
 
 def time_taken(photo: Path) -> tuple[float, bool] | None:
     """UNIX time at which a photo was taken, and whether its time zone is known (else UTC is assumed), or None."""
-    from PIL import Image
-
     try:
-        with Image.open(photo) as image:
+        with _opened(photo) as image:
             tags = image.getexif().get_ifd(EXIF)
         zone = str(tags.get(OFFSET, "")).strip()
         digits = str(tags.get(FRACTION, "")).strip()
@@ -69,10 +73,8 @@ def time_taken(photo: Path) -> tuple[float, bool] | None:
 
 def orientation(photo: Path) -> int:
     """How a photo is turned when displayed, EXIF's 1 to 8; 1: as stored, or unknown."""
-    from PIL import Image
-
     try:
-        with Image.open(photo) as image:
+        with _opened(photo) as image:
             value = int(image.getexif().get(ORIENTATION, 1))
     except Exception:  # as above
         return 1

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -44,6 +45,16 @@ def size_of(path: Path, *, parts: bool = False) -> tuple[int, int]:
     if not (parts and decoder.PARTS):
         _check_size(path, width, height)
     return width, height
+
+
+def check_decoders(paths: Iterable[Path]) -> None:
+    """Check that the decoders of photos are installed.
+
+    Raises:
+        UnavailableError: one isn't; names a photo that needs it.
+    """
+    for path in {path.suffix.lower(): path for path in paths}.values():
+        require(str(path), *plugins.needs(_module(path)))
 
 
 def check_decodes(path: Path) -> None:
@@ -146,8 +157,13 @@ def _png_options() -> list[int]:
 
 def _decoder(path: Path) -> Decoder:
     file_checks.check(path)
-    decoder: Decoder = plugins.module(decoders.__name__, DECODERS.get(path.suffix.lower(), "opencv"))
+    decoder = _module(path)
     require(str(path), *plugins.needs(decoder))
+    return decoder
+
+
+def _module(path: Path) -> Decoder:
+    decoder: Decoder = plugins.module(decoders.__name__, DECODERS.get(path.suffix.lower(), "opencv"))
     return decoder
 
 

@@ -53,11 +53,12 @@ def write_plain(path: Path, mesh: Mesh) -> None:
 
 
 def _write_materials(path: Path, names: PageNames) -> None:
-    """Write matt materials for the used pages."""
-    lines = [
-        f"newmtl {names.materials[page]}\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {names.images[page]}\n"
-        for page in names.used
-    ]
+    """Write matt materials for the used pages.
+
+    With the roughness `Pr`: without it, Gazebo takes 0, a mirror, for which its renderer warns of NaNs in the shader.
+    """
+    matt = "Ka 1 1 1\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nPr 1\nPm 0\n"
+    lines = [f"newmtl {names.materials[page]}\n{matt}map_Kd {names.images[page]}\n" for page in names.used]
     path.write_text("\n".join(lines), encoding="ascii")
 
 

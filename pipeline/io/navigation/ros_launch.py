@@ -14,8 +14,10 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io.worlds.sdf import numbers
-from scan2sim.pipeline.simulation.robot import Robot, Start
+from scan2sim.pipeline.simulation.robot import OPTICAL_FRAME, Robot, Start
 
+OPTICAL_AXES = ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
+"""Rotation from the camera's optical axes (x right, y down, z ahead) to the robot's (x ahead, y left, z up)."""
 BRIDGED = (
     "/clock@rosgraph_msgs/msg/Clock[gz.msgs.Clock",
     "/cmd_vel@geometry_msgs/msg/Twist]gz.msgs.Twist",
@@ -54,11 +56,12 @@ def write(
     nodes.append(
         f"static_transform('world', 'odom', {_transform(_pose(at))}, condition=UnlessCondition(localization)),"
     )
-    sensors = [(robot.lidar.link, "lidar", 0.0), (robot.camera.link, "camera", robot.camera.ahead)]
-    for link, sensor, ahead in sensors:
-        place = np.eye(4)
-        place[:3, 3] = np.asarray(robot.link(link).place) + [ahead, 0, 0]
-        nodes.append(f"static_transform({robot.base.name!r}, '{robot.name}/{link}/{sensor}', {_transform(place)}),")
+    lidar, camera = np.eye(4), np.eye(4)
+    lidar[:3, 3] = robot.link(robot.lidar.link).place
+    camera[:3, :3] = OPTICAL_AXES
+    camera[:3, 3] = np.asarray(robot.link(robot.camera.link).place) + [robot.camera.ahead, 0, 0]
+    for frame, place in ((f"{robot.name}/{robot.lidar.link}/lidar", lidar), (OPTICAL_FRAME, camera)):
+        nodes.append(f"static_transform({robot.base.name!r}, {frame!r}, {_transform(place)}),")
     imu = f"static_transform({robot.base.name!r}, '{robot.name}/{robot.base.name}/imu', {_transform(np.eye(4))}),"
     nodes.append(imu)
     x, y, z = at.position

@@ -54,11 +54,12 @@ class Model:
         shots: photos that have a pose.
         xyz: (N, 3) points, model coordinates: sparse ones, or a cloud of the program.
         rgb: (N, 3) their colours, or None.
-        T_earth: (4, 4) similarity from model coordinates to geocentric ones (WGS 84, metres), or None if the model
-            isn't georeferenced.
+        T_earth: (4, 4) similarity from model coordinates to geocentric ones (metres), or None if the model isn't
+            georeferenced.
         crs: projected CRS of the program's project, or None.
         notes: warnings for the user, such as photos that are left out.
         up: direction of the model that becomes +z if its CRS isn't known and the user gives none; None for +z.
+        datum: geographic CRS (WKT) of the geocentric coordinates, degrees from Greenwich; None: WGS 84.
     """
 
     cameras: dict[str, Camera]
@@ -69,6 +70,7 @@ class Model:
     crs: str | None = None
     notes: tuple[str, ...] = ()
     up: tuple[float, float, float] | None = None
+    datum: str | None = None
 
     @property
     def centres(self) -> F64:

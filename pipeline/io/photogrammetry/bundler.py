@@ -19,13 +19,14 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
+from scan2sim.pipeline.io.trajectory_columns import is_number
 
 REMEDY = "Give Bundler's .out file (often bundle/bundle.out)"
 FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def read(model: Path, photos: Photos) -> Model:
-    """Read a .out file; its list of photos is `list.txt` or `<name>.txt` beside it, or one folder up."""
+    """Read a .out file; its list of photos is beside it, or one folder up: `list.txt`, or as `_names` lists."""
     path = next((model / p for p in ("bundle.out", "bundle/bundle.out") if (model / p).is_file()), model)
     lines = non_empty_lines(path)
     try:
@@ -90,15 +91,24 @@ def camera_key(known: dict[Camera, str], camera: Camera) -> str:
 
 
 def _names(path: Path) -> list[str]:
-    candidates = [
-        folder / name for folder in (path.parent, path.parent.parent) for name in ("list.txt", f"{path.stem}.txt")
-    ]
+    """Names of the photos: a line each, which may end with `0` and the focal length by EXIF.
+
+    The list has the name that Bundler, COLMAP (`bundle.list.txt`) or RealityCapture (`imagelist.lst`) gives it.
+    """
+    names = ("list.txt", f"{path.stem}.txt", f"{path.stem}.list.txt", f"{path.name}.list.txt", f"{path.stem}.lst")
+    candidates = [folder / name for folder in (path.parent, path.parent.parent) for name in (*names, "imagelist.lst")]
     found = next((candidate for candidate in candidates if candidate.is_file()), None)
     if found is None:
         raise InputError(
             candidates[0], "file not found: Bundler's cameras have no names", "Put the list of photos there"
         )
-    return [line.split()[0] for line in non_empty_lines(found)]
+    return [_without_number(_without_number(line)) for line in non_empty_lines(found)]
+
+
+def _without_number(line: str) -> str:
+    """A line without the number at its end, if it has one; names may contain blanks."""
+    words = line.rsplit(maxsplit=1)
+    return words[0] if len(words) > 1 and is_number(words[1]) else line
 
 
 def _camera(size: tuple[int, int], f: float, k1: float, k2: float) -> Camera:

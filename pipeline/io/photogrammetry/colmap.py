@@ -21,6 +21,7 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera, CameraModel
 from scan2sim.pipeline.io import colmap_rigs, file_checks
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
+from scan2sim.pipeline.io.trajectory_columns import is_number
 
 # COLMAP's camera model: ours, number of focal lengths, indices of COLMAP's coefficients among ours
 MODELS: dict[str, tuple[CameraModel, int, tuple[int, ...]]] = {
@@ -208,11 +209,16 @@ def _camera_lines(lines: list[str]) -> Iterator[ColmapCamera]:
 
 
 def _image_lines(lines: list[str]) -> Iterator[ColmapImage]:
-    rest = iter(lines)
-    for line in _rows(rest):
-        words = line.split(maxsplit=9)
-        yield _posed(int(words[0]), int(words[8]), words[9].strip(), tuple(map(float, words[1:8])))
-        next(rest, None)  # its observations, which may be an empty line
+    """Photos; each is followed by a line of its observations, which may be empty and which other programs omit."""
+    after_photo = False
+    for line in lines:
+        words = line.split()
+        if line.startswith("#") or (after_photo and len(words) % 3 == 0 and all(map(is_number, words[:12]))):
+            after_photo = after_photo and line.startswith("#")
+        elif words:
+            words = line.split(maxsplit=9)
+            yield _posed(int(words[0]), int(words[8]), words[9].strip(), tuple(map(float, words[1:8])))
+            after_photo = True
 
 
 def _point_lines(lines: list[str]) -> Iterator[Point]:

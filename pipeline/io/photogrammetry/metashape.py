@@ -1,8 +1,9 @@
 """Agisoft Metashape models, `cameras.xml` (Export Cameras, Agisoft XML).
 
 A camera's `transform` is camera to chunk, row-major, with OpenCV's axes. Its component's `transform` (rotation, scale,
-translation), or the chunk's if it has none, maps to geocentric coordinates if the chunk's `reference` is a CRS of the
-Earth, and to the reference's own coordinates if that is local. Only the largest of several components is read.
+translation), or the chunk's if it has none, maps to geocentric coordinates, in the datum of the chunk's `reference` if
+that is a CRS of the Earth, and to the reference's own coordinates if it is local. Only the largest of several
+components is read.
 
 In a multi-camera system only the master camera has a `transform`; the others name it (`master_id`), and their sensor
 has `rotation` and `translation`, from its own axes to those of the master's, in the chunk's units. The camera model:
@@ -15,13 +16,14 @@ so that its p1, p2 are OpenCV's p2, p1; the centre of the top left pixel is (0.5
 (x, y) is the angle to the axis instead of its tangent. OpenCV has no such k4: if there is one, OpenCV's k1...k6 are
 fitted to the same distortion; the camera is rejected if the fit error exceeds 0.05 pixels. b2 isn't supported.
 
-Source: Metashape Professional user manual 2.1, appendix D, Camera models.
+Source: Metashape Professional user manual 2.1, appendix D, Camera models; `CoordinateSystem.geoccs` of its Python API.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -86,7 +88,8 @@ def read(model: Path, photos: Photos) -> Model:
         return found.transformed(onto)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = onto.scale * onto.rotation, onto.translation
-    return Model(cameras, found.shots, found.xyz, None, T, _projected(model, reference), found.notes)
+    crs, datum = _reference(model, reference)
+    return replace(found, rgb=None, T_earth=T, crs=crs, datum=datum)
 
 
 def _pose(camera: Element, cameras: Mapping[str, Element], sensors: Mapping[str, Element]) -> F64 | None:
@@ -198,15 +201,23 @@ def _undistorted(factor: np.polynomial.Polynomial, max_radius: float) -> float:
     return float(r[beyond[0]]) if len(beyond) else float(r[-1])
 
 
-def _projected(model: Path, reference: str) -> str | None:
-    """The chunk's CRS if it is projected, else None."""
+def _reference(model: Path, reference: str) -> tuple[str | None, str | None]:
+    """The chunk's CRS if it is projected, else None; and its geographic CRS as WKT, None for WGS 84."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
     try:
         crs = CRS.from_user_input(reference)
+        own = crs.source_crs if crs.is_bound and crs.source_crs is not None else crs  # without its shift to WGS 84
+        geographic = own.geodetic_crs
+        if geographic is None:
+            raise CRSError("it has no datum")
     except CRSError as error:
         raise InputError(model, f"its reference is not a valid CRS ({str(error)[:80]})", REMEDY) from None
-    if not crs.is_projected:
-        return None
-    return crs_io.short(crs.to_wkt())
+    meridian = geographic.prime_meridian
+    if meridian is not None and meridian.longitude:
+        cause = f"its reference {crs.name} counts longitudes from {meridian.name}, which is not supported"
+        raise InputError(model, cause, "Convert the chunk to another coordinate system, and export the cameras again")
+    wgs84 = geographic.to_2d().equals(CRS.from_epsg(4326), ignore_axis_order=True)
+    projected = crs_io.short(crs.to_wkt()) if crs.is_projected else None
+    return projected, None if wgs84 else geographic.to_2d().to_wkt()

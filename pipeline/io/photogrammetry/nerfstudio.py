@@ -37,6 +37,13 @@ PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL",
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE")
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of `distortion_params`."""
+CAPTURES = {
+    "keyframes": ("raw data of Polycam", "Convert it: ns-process-data polycam --data CAPTURE.zip --output-dir FOLDER"),
+    "EXR_RGBD": ("a capture of Record3D", "Convert it: ns-process-data record3d --data FOLDER --output-dir OTHER"),
+    "rgbd": ("an unpacked .r3d of Record3D", "Export an EXR + RGB sequence, and convert it: ns-process-data record3d"),
+    "sparse": ("a project of COLMAP", "Use scan2sim import colmap FOLDER/sparse/0 FOLDER/images"),
+}
+"""Folders in captures, what they belong to, and what to do."""
 MAX_STRETCH = 0.01
 """Largest relative difference of the aspect ratio of an image to that of its intrinsics."""
 MAX_NAMES = 3  # listed in a warning
@@ -45,6 +52,8 @@ MAX_NAMES = 3  # listed in a warning
 def read(model: Path, photos: Photos) -> Model:
     """Read a transforms.json, or the one of a folder; frames without an image are left out."""
     path = model / FILE if model.is_dir() else model
+    if not path.exists():
+        _check_folder(model)
     body = _body(path)
     cameras: dict[Camera, str] = {}
     shots: list[Shot] = []
@@ -87,6 +96,17 @@ def read(model: Path, photos: Photos) -> Model:
         up=up,
         notes=tuple(notes),
     )
+
+
+def _check_folder(folder: Path) -> None:
+    """Check that a folder isn't a capture from which nerfstudio first makes a transforms.json.
+
+    Raises:
+        InputError: it is one; names the command.
+    """
+    for inside, (what, remedy) in CAPTURES.items():
+        if (folder / inside).exists():
+            raise InputError(folder, f"is {what}, without a {FILE}", remedy)
 
 
 def _listed(names: Sequence[str], what: str) -> str:

@@ -4,8 +4,12 @@ Poses are world to camera (axis-angle and translation) with OpenCV's axes. Pixel
 middle of the image, its longer side has length 1. The world is topocentric: metres east, north and up of
 `reference_lla`. It is transformed to a projected CRS: that of the ODM project (`coords.txt`), or UTM.
 
+ODM renames that file to `reconstruction.topocentric.json`, and its `reconstruction.json` is in the project's CRS
+minus the offset of `coords.txt`: turned by the meridian convergence, and shifted. The former is read.
+
 Source: OpenSfM's documentation (https://opensfm.org/docs/geometry.html, dataset.html) and its
-`opensfm/src/geometry/camera_distortions_functions.h`; its Brown model has OpenCV's order of coefficients.
+`opensfm/src/geometry/camera_distortions_functions.h`; its Brown model has OpenCV's order of coefficients. ODM's
+`stages/run_opensfm.py` and the command export_geocoords of its OpenSfM.
 """
 
 from __future__ import annotations
@@ -24,7 +28,8 @@ from scan2sim.pipeline.io.geodata.crs import utm_zone
 from scan2sim.pipeline.io.photogrammetry import Model, Photos, Shot
 
 REMEDY = "Export it again, or give the reconstruction.json of a finished project"
-FILES = ("reconstruction.json", "opensfm/reconstruction.json")
+RECONSTRUCTION, TOPOCENTRIC = "reconstruction.json", "reconstruction.topocentric.json"
+FILES = (RECONSTRUCTION, f"opensfm/{RECONSTRUCTION}")
 # projection type: our model, and its coefficients in our order
 MODELS: dict[str, tuple[CameraModel, tuple[str, ...]]] = {
     "perspective": ("opencv", ("k1", "k2", "", "")),
@@ -38,7 +43,7 @@ MODELS: dict[str, tuple[CameraModel, tuple[str, ...]]] = {
 
 def read(model: Path, photos: Photos) -> Model:
     """Read the largest part of a reconstruction.json, or of the one in a project folder of OpenSfM or ODM."""
-    path = next((model / name for name in FILES if (model / name).is_file()), model) if model.is_dir() else model
+    path = _file(model)
     parts = _parts(path)
     part = max(parts, key=lambda part: len(part["shots"]))
     left = sum(len(other["shots"]) for other in parts) - len(part["shots"])
@@ -56,6 +61,21 @@ def read(model: Path, photos: Photos) -> Model:
             raise InputError(path, f"{shot.file} has the unknown camera {shot.camera!r}", REMEDY)
     note = (f"{left} photos of {len(parts) - 1} smaller parts are left out",) if left else ()
     return Model(cameras, shots, xyz, np.clip(rgb, 0, 255).astype(np.uint8), earth, _crs(path), note)
+
+
+def _file(model: Path) -> Path:
+    """The topocentric reconstruction of a file or project folder.
+
+    Raises:
+        InputError: it is ODM's reconstruction of undistorted photos, which is in projected coordinates.
+    """
+    path = next((model / name for name in FILES if (model / name).is_file()), model) if model.is_dir() else model
+    if (path.parent / TOPOCENTRIC).is_file():
+        return path.parent / TOPOCENTRIC
+    if path.parent.name == "undistorted" and (path.parent.parent / TOPOCENTRIC).is_file():
+        cause = "is ODM's model of undistorted photos, in projected coordinates without their offset"
+        raise InputError(path, cause, f"Give {path.parent.parent / TOPOCENTRIC} and the original photos")
+    return path
 
 
 def _parts(path: Path) -> list[Any]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.worlds.sdf import WITHOUT_BACKDROP, numbers, write_config
-from scan2sim.pipeline.simulation.robot import Box, Link, Robot, Sphere, Start
+from scan2sim.pipeline.simulation.robot import OPTICAL_FRAME, Box, Link, Robot, Sphere, Start
 
 LABELS_RATE_HZ = 5.0
 """Update rate of the segmentation camera."""
@@ -99,7 +99,8 @@ def _sensors(robot: Robot, link: Link) -> str:
     if link.name == robot.camera.link:
         offset = f"<pose>{robot.camera.ahead:g} 0 0 0 0 0</pose>\n        "
         segmentation = "<segmentation_type>semantic</segmentation_type>"
-        return _sensor("camera", "camera", robot.camera.rate, offset + _camera(robot, "")) + _sensor(
+        frame = f"<optical_frame_id>{OPTICAL_FRAME}</optical_frame_id>"
+        return _sensor("camera", "camera", robot.camera.rate, offset + _camera(robot, frame)) + _sensor(
             "segmentation", "labels", LABELS_RATE_HZ, offset + _camera(robot, segmentation)
         )
     return _sensor("gpu_lidar", "lidar", robot.lidar.rate, _lidar(robot)) if link.name == robot.lidar.link else ""

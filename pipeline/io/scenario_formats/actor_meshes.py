@@ -51,6 +51,7 @@ def write_obj(path: Path, actor: Actor) -> int:
         red, green, blue = (f"{(channel / 255) ** 2.2:.4f}" for channel in found[0].colour)
         materials.append(
             f"newmtl {material}\nKa {red} {green} {blue}\nKd {red} {green} {blue}\nKs 0 0 0\nd 1\nillum 1\n"
+            f"Pr {ROUGHNESS.get(material, 0.9)}\nPm 0\n"
         )
         vertices, faces = _joined(found)
         corners = vertices[faces]

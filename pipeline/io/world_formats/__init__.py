@@ -20,6 +20,7 @@ from typing import Any, Literal, Protocol
 from pydantic import Field
 
 from scan2sim.pipeline.core.errors import DataError, ScanError, SettingError, SpaceError, from_exception
+from scan2sim.pipeline.core.parameters import is_reserved
 from scan2sim.pipeline.core.plugins import find, module, names
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.core.types import Mesh
@@ -53,6 +54,8 @@ class SceneParams(GlbParams):
         source_pages: write a mask for each of these pages with the source of each texel's colour: 255 a photo, 128
             the cloud's points, 64 inpainted, 0 no surface.
         ceiling: ceilings of indoor maps: a model of their own, or left out.
+        backdrop: the backdrop, if there is one, is part of the world (Gazebo, GLB, USD). Gazebo's depth and RGB-D
+            cameras, which can't ignore it as its lidars can, need worlds without it.
     """
 
     meshes: tuple[str, ...] = Field(
@@ -75,6 +78,7 @@ class SceneParams(GlbParams):
         "removed), or hidden.",
     )
     source_pages: bool = Field(False, description="Write a mask for each texture page with the source of colours.")
+    backdrop: bool = Field(True, description="Write the backdrop, if there is one (Gazebo, GLB, USD).")
 
 
 class Format(Protocol):
@@ -138,11 +142,16 @@ def write(
             recorded traffic of Gazebo's world, the README ("readme"). None: their errors are raised.
 
     Raises:
-        ScanError: as `check`, or there is no start pose for the robot; raised before anything is written.
+        ScanError: as `check`, a name is reserved, or there is no start pose for the robot; raised before anything is
+            written.
     """
     check(formats, params, "export.formats", robot)
+    _check_reserved(scene)
     if params.ceiling == "hidden":
         scene = replace(scene, tiles=tuple(map(_without_ceiling, scene.tiles)))
+    if not params.backdrop:
+        tiles = tuple(replace(tile, shows_backdrop=False) for tile in scene.tiles)
+        scene = replace(scene, tiles=tiles, dome=None)
     if robot:
         _check_names(scene)
         scene = replace(scene, start=find_spawn_pose(scene))
@@ -248,6 +257,14 @@ CEILING = "ceiling"
 """Surface that Gazebo's world has as a model of its own."""
 
 
+def _check_reserved(scene: Scene) -> None:
+    """Raise an error if a tile or the world has a name that simulators reserve, as in worlds of earlier versions."""
+    for name in (scene.name, *(tile.name for tile in scene.tiles)):
+        if is_reserved(name):
+            cause = "is reserved by simulators (SDF, MuJoCo), and the name of a tile or the world"
+            raise DataError(name, cause, "Change `name` in the tile.toml or survey.toml, and run it again")
+
+
 def _check_names(scene: Scene) -> None:
     """Raise an error if a tile or the world has the robot's name."""
     if _is_robot_name(scene):
@@ -306,11 +323,11 @@ def sky_metadata(scene: Scene) -> dict[str, Any]:
     return colour | ({"camera_far_m": ceil(scene.far)} if scene.far else {})
 
 
-def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams) -> PageNames:
-    """Write a group's texture pages into `folder`; returns their names."""
+def write_pages(folder: Path, group: str, shape: Textured, params: SceneParams, prefix: str = "") -> PageNames:
+    """Write a group's texture pages into `folder`; returns their names. `prefix` is that of the images' names."""
     make_folder(folder)
     materials = tuple(f"{group}_{page}" for page in range(len(shape.pages)))
-    images = tuple(f"{name}.{'png' if params.pages == 'png' else 'jpg'}" for name in materials)
+    images = tuple(f"{prefix}{name}.{'png' if params.pages == 'png' else 'jpg'}" for name in materials)
     for page in shape.used_pages:
         if params.pages == "png":
             shutil.copyfile(shape.pages[page], folder / images[page])  # a copy, not a link: users may edit it

@@ -5,7 +5,8 @@ props"): `carla/<name>.json`; the ground as a map, `carla/<name>/<name>.fbx` and
 CARLA's importer distinguishes roads, sidewalks and terrain (`<name>_Road_Road_<tile>`); everything else as props with
 tags for its semantic camera, `carla/props/<prop>/<prop>.fbx`, one per tile and class. Ground larger than
 `LARGE_MAP_TILE_M` is written as a large map, in squares `<name>_Tile_<x>_<y>.fbx`, y growing southwards, with texture
-pages in `.fbm` folders.
+pages in `.fbm` folders. Its props are a package of their own, `carla/<name>_props.json`: in the package of a large map,
+CARLA's importer would take them for tiles, whose vertices it makes relative to their squares.
 
 All coordinates are metres from the scene's origin, y to the north. CARLA flips y on import of both FBX and OpenDRIVE.
 """
@@ -42,9 +43,9 @@ TERRAIN_NAME = "Terrain"
 PROP_TAGS = {
     CODE["building"]: "Building", CODE["tower"]: "Building", CODE["wall_or_fence"]: "Wall", CODE["pole"]: "Pole",
     CODE["road_sign"]: "TrafficSign", CODE["low_vegetation"]: "Vegetation", CODE["mid_vegetation"]: "Vegetation",
-    CODE["high_vegetation"]: "Vegetation", CODE["vehicle"]: "Vehicles",
+    CODE["high_vegetation"]: "Vegetation", CODE["vehicle"]: "Car",
 }  # fmt: skip
-"""Semantic tags of props; CARLA labels assets by the folder of that name."""
+"""Semantic tags of props; CARLA labels assets by the folder of that name, and gives others no label (`Tagger.cpp`)."""
 DEFAULT_TAG = "Static"
 
 
@@ -93,8 +94,13 @@ class _Package:
             map_entry |= {"tile_size": LARGE_MAP_TILE_M, "tiles": [f"./{file}" for file in files]}
         elif files:  # a world without ground has no map
             map_entry["source"] = f"./{files[0]}"
-        text = json.dumps({"maps": [map_entry] if files else [], "props": self._props}, indent=2)
-        (self._folder / f"{name}.json").write_text(text + "\n", encoding="ascii")
+        maps = [map_entry] if files else []
+        packages = {name: (maps, self._props)}
+        if self._squares > 1:
+            packages = {name: (maps, []), f"{name}_props": ([], self._props)}
+        for package, (its_maps, its_props) in packages.items():
+            text = json.dumps({"maps": its_maps, "props": its_props}, indent=2)
+            (self._folder / f"{package}.json").write_text(text + "\n", encoding="ascii")
 
     def _add_ground(self, tile: SceneTile, ground: Textured) -> None:
         codes, squares = _codes(tile, ground), self._square(ground.mesh.corners.mean(axis=1))

@@ -3,6 +3,8 @@
 Layout: `<name>.sdf`, and for each tile `models/<tile>/` with `model.sdf`, `model.config` and `meshes/`: one file per
 class (a visual with its label), and the collision shapes (`collision_<class>.obj`; poles and trunks are cylinders).
 `<name>_traffic.world` is the world with the recorded traffic: actors whose shapes are in `models/<actor>/`.
+Texture pages have the model's name (`<tile>_<class>_<page>.png`): Gazebo takes textures of the same file name for one,
+whatever their folders (gz-rendering #139), so that all tiles would get those of the first.
 What only cameras see is in visuals of their own (`backdrop.obj`, `backdrop_sky.obj`), with a visibility flag.
 Ceilings of rooms are a model of their own, `<tile>_ceiling`, so that a user can remove them for a view from above.
 Tiles of a survey are in separate levels, which the simulator loads on demand; its sky,
@@ -113,7 +115,7 @@ def _model(
     surfaces = {group: (shape, by_class(group, shape)) for group, shape in shapes.items()}
     backdrop = solid.backdrop() if solid else []
     for group, (shape, own) in (surfaces | {surface.name: (surface.shape, [surface]) for surface in backdrop}).items():
-        names = world_formats.write_pages(meshes, group, shape, params)
+        names = world_formats.write_pages(meshes, group, shape, params, f"{name}_")
         for surface in own:
             for part in surface.parts(params.max_visual_triangles):
                 for mesh_format in formats.values():

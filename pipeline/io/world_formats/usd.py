@@ -10,6 +10,7 @@ is in the custom data of the root layer and of `/World`, as USD has no schema fo
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ from scan2sim.pipeline.io.worlds.textured_mesh import unique_uv, vertex_normals
 from scan2sim.pipeline.simulation.collision_shapes import Solid, solids
 
 NEEDS = ("pxr",)
+# Version of crate files, read when `pxr` is first imported. Some releases (24.11, 25.02) write 0.10.0 by default, which
+# programs with OpenUSD before 23.11 can't open (Isaac Sim up to 4.5). Nothing in these files needs more than 0.8.0.
+os.environ.setdefault("USD_WRITE_NEW_USDC_FILES_AS_VERSION", "0.8.0")
 FOLDER = "usd"
 VARIANT_SET, FINEST_VARIANT = "levelOfDetail", "finest"
 SKY_INTENSITY_NITS = 1000.0

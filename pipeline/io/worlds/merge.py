@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.core.errors import DataError, InputError, ScanError, from_os_error
+from scan2sim.pipeline.core.paths import new_folder
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.file_checks import copy_tree, copy_with_time
@@ -31,7 +32,7 @@ USER_EDITABLE_SUFFIXES = (
 )  # fmt: skip
 """Suffixes of files that users edit by hand: copied, never linked."""
 STAMP_FILE, ROADS_STAMP_FILE, DOME_STAMP_FILE = ".result", ".roads", ".dome"
-VERSION = 6
+VERSION = 7
 """Version of the layout: when it changes, worlds are rebuilt."""
 
 
@@ -167,13 +168,16 @@ def same_unless_edited(source: Path, copy: Path) -> bool:
 
 
 def swap(new: Path, target: Path) -> None:
-    """Rename a finished folder to `target`; an existing folder there is deleted afterwards."""
-    earlier = target.with_name(f".{target.name}-earlier")
-    shutil.rmtree(earlier, ignore_errors=True)
+    """Rename a finished folder to `target`; an existing folder there is deleted afterwards.
+
+    NFS can't delete the folder of a file that a program (a simulator, say) has open: that is tried again next time.
+    """
+    prefix = f".{target.name}-earlier"
     if target.exists():
-        target.rename(earlier)
+        target.rename(new_folder(target.parent, f"{prefix}-") / target.name)
     new.rename(target)
-    shutil.rmtree(earlier, ignore_errors=True)
+    for earlier in target.parent.glob(f"{prefix}*"):
+        shutil.rmtree(earlier, ignore_errors=True)
 
 
 def _check(tiles: Sequence[TileWorld]) -> None:

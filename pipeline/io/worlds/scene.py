@@ -124,6 +124,7 @@ class SceneTile:
         folder: folder with its files.
         codes: LAS code of the faces of a group that have none of their own, where it isn't that of the group.
         sky: colour of what its photos show where it has nothing, sRGB 0 to 255, or None.
+        shows_backdrop: whether its backdrop, if there is one, is exported.
     """
 
     name: str
@@ -134,6 +135,7 @@ class SceneTile:
     folder: Path
     codes: Mapping[str, int] = field(default_factory=dict)
     sky: Colour | None = None
+    shows_backdrop: bool = True
 
     def textured(self) -> dict[str, Textured]:
         """Its complete surfaces, by group."""
@@ -150,9 +152,14 @@ class SceneTile:
 
     def backdrop(self) -> list[Surface]:
         """What only cameras see beyond its surfaces: `BACKDROP_PARTS`, empty without a backdrop."""
-        shape = textured.read(self.folder / BACKDROP) if (self.folder / BACKDROP).is_dir() else None
+        shape = textured.read(self.folder / BACKDROP) if self.has_backdrop else None
         pages = shape.used_pages if shape else []
         return [Surface(BACKDROP_PARTS[k], BACKDROP, BACKDROP_CODE, shape.on_page(k)) for k in pages if shape]
+
+    @property
+    def has_backdrop(self) -> bool:
+        """Whether it shows more to cameras than was scanned."""
+        return self.shows_backdrop and (self.folder / BACKDROP).is_dir()
 
     def splats(self) -> SplatLayer | None:
         """What cameras see of it; None: it was built without."""
@@ -291,6 +298,11 @@ class Scene:
     def has_splats(self) -> bool:
         """Whether a tile has splats."""
         return any(tile.splat_count for tile in self.tiles)
+
+    @property
+    def has_backdrop(self) -> bool:
+        """Whether a tile, or the dome, shows more to cameras than was scanned."""
+        return any(tile.has_backdrop for tile in self.with_dome)
 
     @property
     def with_dome(self) -> tuple[SceneTile, ...]:

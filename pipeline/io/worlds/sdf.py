@@ -3,8 +3,9 @@
 Design decisions:
 
 - The world lists its systems. A world without any gets Gazebo's default ones, which don't include
-  the sensors; a world that lists any gets no default. The names are those of Garden and later; Fortress
-  accepts them since 6.16 (gz-sim #2275).
+  the sensors; a world that lists any gets no default. So it lists those of all sensors that every release from
+  Fortress on has: a user's robot may have any of them, and without its system a sensor is silent. The names are those
+  of Garden and later; Fortress accepts them since 6.16 (gz-sim #2275).
 - World axes are the CRS's grid axes, so that world coordinates plus the origin are CRS coordinates.
   Grid north is not true north: `heading_deg` compensates the meridian convergence at the world's
   origin. With 0 a NavSat sensor would be 3 m off at 100 m where the convergence is 2 degrees.
@@ -15,8 +16,9 @@ Design decisions:
 - Every visual has the LAS code of its class as label for Gazebo's segmentation cameras.
 - `<laser_retro>` of a visual is what the sensor `gpu_lidar` returns as intensity, at every range and angle: 255 times
   the reflectance, the scale of 8-bit lidars (Gazebo accepts 0 to 2000). Without it intensities are 0.
-- The backdrop is what only cameras see. Its visuals have the visibility flag `BACKDROP_FLAG`; lidars and depth cameras
-  need the mask `WITHOUT_BACKDROP`, which the robot's lidar has.
+- The backdrop is what only cameras see. Its visuals have the visibility flag `BACKDROP_FLAG`; lidars need the mask
+  `WITHOUT_BACKDROP`, which the robot's has. Depth and RGB-D cameras ignore masks (`Ogre2DepthCamera.cc` of gz-rendering
+  6 to 10): they need a world without it (`export.backdrop`).
 - Gazebo loads a level when the performer's box intersects the level's box, and unloads it when the
   performer is `<buffer>` away from it (gz-sim #28: the buffer has no effect on loading). Therefore a
   level's box is larger than its tile; otherwise a robot would see a tile only when standing on it.
@@ -45,6 +47,19 @@ WITHOUT_BACKDROP = 0xFFFFFFFF & ~BACKDROP_FLAG
 """`<visibility_mask>` of sensors that must not see the backdrop."""
 LASER_RETRO_FULL = 255
 """`<laser_retro>` of reflectance 1."""
+SYSTEMS = {
+    "physics": "Physics",
+    "user-commands": "UserCommands",
+    "scene-broadcaster": "SceneBroadcaster",
+    "contact": "Contact",
+    "imu": "Imu",
+    "navsat": "NavSat",
+    "magnetometer": "Magnetometer",
+    "altimeter": "Altimeter",
+    "air-pressure": "AirPressure",
+    "forcetorque": "ForceTorque",
+}
+"""Systems of a world besides that of rendered sensors: the middle of their library's name, and their class."""
 LEVEL_BUFFER_M = 20.0
 """Distance from a tile at which a performer loads it."""
 SPAWN_FRAME = "spawn_pose"
@@ -176,8 +191,7 @@ def write_levels(
             f"""{_spawn_note(spawn)}
      All tiles are loaded then. With the option "levels" (two dashes before it, which XML forbids here) only those
      near a performer are: the model that <performer> names below, if it is in this file when Gazebo starts, and
-     any model that is named to the service /world/{name}/level/set_performer later.
-     Fortress reads levels only where the last plugin below is named ignition::gazebo.""",
+     any model that is named to the service /world/{name}/level/set_performer later.""",
         ),
         encoding="utf-8",
     )
@@ -247,8 +261,9 @@ def _world(
 ) -> str:
     """SDF of a world: physics, systems, light and `content`; `note` is added to the leading comment."""
     return f"""<?xml version="1.0"?>
-<!-- Run in this folder: GZ_SIM_RESOURCE_PATH=$PWD/models gz sim {path.name}
-     (Fortress: IGN_GAZEBO_RESOURCE_PATH=$PWD/models ign gazebo {path.name}){note} -->
+<!-- Run in this folder: {open_command(path.name)}
+     (Fortress, from 6.16: {open_command(path.name, fortress=True)})
+     Gazebo Classic (gazebo, gzserver) doesn't read it.{note} -->
 <sdf version="1.9">
   <world name="{name}">
     <physics name="dart_1ms" type="dart">
@@ -256,13 +271,7 @@ def _world(
       <real_time_factor>1</real_time_factor>
     </physics>
     <gravity>0 0 -9.8</gravity>
-    <plugin filename="gz-sim-physics-system" name="gz::sim::systems::Physics"/>
-    <plugin filename="gz-sim-user-commands-system" name="gz::sim::systems::UserCommands"/>
-    <plugin filename="gz-sim-scene-broadcaster-system" name="gz::sim::systems::SceneBroadcaster"/>
-    <plugin filename="gz-sim-contact-system" name="gz::sim::systems::Contact"/>
-    <plugin filename="gz-sim-imu-system" name="gz::sim::systems::Imu"/>
-    <plugin filename="gz-sim-navsat-system" name="gz::sim::systems::NavSat"/>
-    <plugin filename="gz-sim-sensors-system" name="gz::sim::systems::Sensors">
+{_systems()}    <plugin filename="gz-sim-sensors-system" name="gz::sim::systems::Sensors">
       <render_engine>ogre2</render_engine>
     </plugin>
 {_spherical_coordinates(georeference)}    <scene>
@@ -280,6 +289,19 @@ def _world(
 {content}  </world>
 </sdf>
 """
+
+
+def open_command(world: str, *, fortress: bool = False) -> str:
+    """Command that opens a world in its folder and starts it; models of the user's own are found as before."""
+    variable, program = ("IGN_GAZEBO_RESOURCE_PATH", "ign gazebo") if fortress else ("GZ_SIM_RESOURCE_PATH", "gz sim")
+    return f"{variable}=$PWD/models:${variable} {program} -r {world}"
+
+
+def _systems() -> str:
+    return "".join(
+        f'    <plugin filename="gz-sim-{library}-system" name="gz::sim::systems::{name}"/>\n'
+        for library, name in SYSTEMS.items()
+    )
 
 
 def _include(name: str, offset: Vector, angles: Vector = (0.0, 0.0, 0.0)) -> str:

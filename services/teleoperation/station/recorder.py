@@ -102,6 +102,7 @@ class Recorder:
             raise from_os_error(error, folder) from None
         self.dropped = 0
         self._folder, self._limit, self._state, self._begun = folder, limit_bytes, state, begun
+        self._begun_ms = 0
         self._store = typestore()
         self._queue: queue.Queue[tuple[str, str, int, Any]] = queue.Queue(QUEUE_MAX)
         self._ended = threading.Event()
@@ -176,8 +177,9 @@ class Recorder:
         return types[VIDEO](stamp, topic.removeprefix(VIDEO_TOPIC), np.frombuffer(frame.data, np.uint8), form)
 
     def _new_path(self) -> Path:
-        name = f"{PREFIX}{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{time.time_ns() // 10**6 % 1000:03}"
-        return self._folder / name
+        """Path of the next bag; names are in order of recording, also if the clock is set back."""
+        self._begun_ms = max(time.time_ns() // 10**6, self._begun_ms + 1)
+        return self._folder / bag_name(self._begun_ms)
 
     def _delete_oldest(self) -> None:
         """Delete the oldest bags, so that with a new one all fit the limit."""
@@ -185,6 +187,12 @@ class Recorder:
         sizes = {bag: sum(file.stat().st_size for file in bag.glob("*")) for bag in bags}
         while bags and sum(sizes[bag] for bag in bags) > self._limit * (1 - 1 / SEGMENTS):
             shutil.rmtree(bags.pop(0), ignore_errors=True)
+
+
+def bag_name(begun_ms: int) -> str:
+    """Name of a bag by the UNIX time of its beginning in milliseconds; sorted by name, bags are in order of time."""
+    seconds, ms = divmod(begun_ms, 1000)
+    return f"{PREFIX}{time.strftime('%Y%m%d-%H%M%S', time.gmtime(seconds))}-{ms:03}"
 
 
 class Recorded(NamedTuple):

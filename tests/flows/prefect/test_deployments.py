@@ -141,7 +141,9 @@ def test_worker_with_another_version_fails_the_run(toys: Server, folder: Path) -
 def test_run_of_a_killed_worker_is_detected_and_rescheduled(
     tmp_path: Path, folder: Path, new_database: NewDatabase
 ) -> None:
-    text = (ROOT / "deploy" / "automations.yaml").read_text(encoding="utf-8").replace("name: reprocess", "name: toy")
+    text = (ROOT / "deploy" / "automations.yaml").read_text(encoding="utf-8")
+    for flows in ("[reprocess, survey, tile]", "reprocess"):
+        text = text.replace(f"prefect.resource.name: {flows}", "prefect.resource.name: toy")
     (tmp_path / "automations.yaml").write_text(text, encoding="utf-8")
     with serving("sqlite", tmp_path, new_database) as server:
         server.env |= {"PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30", "TOY_FOLDER": str(folder)}

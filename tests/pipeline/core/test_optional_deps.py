@@ -92,6 +92,7 @@ USES = {
     "kiss_icp": ["import sweeps FRAMES"],
     "pymeshlab": ["run TILE --set decimate.backend=pymeshlab"],
     "pye57": ["import clouds cloud.e57"],
+    "pillow_heif": ["import images phone"],
     "zstandard": ["import clouds ept.json"],
     "prefect": ["survey TILE --runner threads"],
     "distributed": ["survey TILE --runner dask"],
@@ -138,6 +139,9 @@ def test_missing_package_raises_the_same_error_in_every_command(
     (tmp_path / "frames").mkdir()
     for number in range(2):
         cv2.imwrite(str(tmp_path / "frames" / f"{number}.png"), np.zeros((8, 16), np.uint8))
+    (tmp_path / "phone").mkdir()
+    for number in range(3):
+        (tmp_path / "phone" / f"{number}.heic").touch()
     (tmp_path / "truth.csv").write_text("time,x,y,z\n0,0,0,0\n1,1,0,0\n2,2,1,0\n3,3,1,0\n", encoding="utf-8")
     (tmp_path / "ept.json").write_text('{"dataType": "zstandard"}', encoding="utf-8")
     (tmp_path / "video.mp4").touch()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,35 @@ def test_damaged_part_is_computed_again(tmp_path: Path, work: Work) -> None:
     provide(tmp_path, work, "1", "photo").write_text("18", encoding="utf-8")
     assert provide(tmp_path, work, "2", "photo").read_text(encoding="utf-8") == "17"
     assert work.times == 2
+
+
+def test_part_that_disappears_while_it_is_linked_leaves_other_results_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another machine removed it, or the disk permits no further link to a file."""
+    texts = iter("1234")
+
+    def work(out: Path) -> list[Path]:
+        for name in ("a.txt", "b.txt"):
+            (out / name).write_text(next(texts), encoding="utf-8")
+        return [out / "a.txt", out / "b.txt"]
+
+    def run(name: str) -> list[str]:
+        (tmp_path / name).mkdir()
+        Parts(tmp_path / "parts").provide(tmp_path / name, [], lambda: work(tmp_path / name))
+        return [(tmp_path / name / file).read_text(encoding="utf-8") for file in ("a.txt", "b.txt")]
+
+    assert run("first") == ["1", "2"]
+    link = os.link
+
+    def link_once(source: Path, target: Path) -> None:
+        if target == tmp_path / "second" / "b.txt":
+            raise FileNotFoundError(source)
+        link(source, target)
+
+    monkeypatch.setattr(os, "link", link_once)
+    assert run("second") == ["3", "4"]
+    assert [(tmp_path / "first" / name).read_text(encoding="utf-8") for name in ("a.txt", "b.txt")] == ["1", "2"]
 
 
 def test_unused_parts_are_removed(tmp_path: Path, work: Work) -> None:

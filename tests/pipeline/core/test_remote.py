@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import os
 from collections.abc import Iterator
 from multiprocessing import forkserver
@@ -11,8 +13,9 @@ import pytest
 
 from scan2sim.flows.engine.execution import execute
 from scan2sim.flows.engine.planning import plan
+from scan2sim.pipeline.core import remote
 from scan2sim.pipeline.core.cache import Store
-from scan2sim.pipeline.core.errors import InputError, UnavailableError
+from scan2sim.pipeline.core.errors import InputError, SpaceError, UnavailableError
 from scan2sim.pipeline.core.remote import CACHE_VARIABLE, Remote, is_remote, local_copy
 from tests.flows.toy import chain
 
@@ -99,6 +102,21 @@ def test_remote_source_is_fetched(s3: str, tmp_path: Path) -> None:
     assert store.source(second.local / "cloud.laz").read_text(encoding="utf-8") == "points"
 
 
+def test_machine_with_an_older_copy_of_a_source_fetches_the_new_one(tmp_path: Path) -> None:
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    remote = Remote("memory://daily", tmp_path / "cache")
+    store, cloud = Store(tmp_path / "steps", sources=remote), remote.local / "cloud.laz"
+    files.pipe_file("/daily/cloud.laz", b"Monday")
+    assert store.source(cloud).read_bytes() == b"Monday"
+    files.pipe_file("/daily/cloud.laz", b"Tuesday")
+    planned = hashlib.sha256(b"Tuesday").hexdigest()
+    assert store.source(cloud, planned).read_bytes() == b"Tuesday"
+    files.pipe_file("/daily/cloud.laz", b"half of Wedn")
+    cloud.unlink()
+    with pytest.raises(InputError, match=r"memory://daily/cloud.laz: has changed during the run"):
+        store.source(cloud, planned)
+
+
 def test_damaged_local_copy_is_fetched_and_damaged_remote_result_rebuilt(s3: str, tmp_path: Path) -> None:
     (tmp_path / "source.txt").write_text("1", encoding="utf-8")
     log, remote = tmp_path / "log", Remote(f"{s3}/damaged", tmp_path / "here")
@@ -134,6 +152,63 @@ def test_key_with_path_traversal_is_rejected(tmp_path: Path, monkeypatch: pytest
         with pytest.raises(InputError, match="points outside of its folder"):
             here.pull([key])
     assert not list(tmp_path.rglob("escaped.txt")) and not Path("/etc/escaped.txt").exists()
+
+
+def test_objects_that_mark_folders_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As "Create folder" of AWS's console makes them."""
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    here = Remote("memory://marked", tmp_path / "cache")
+    files.pipe_file("/marked/tile/cloud.laz", b"points")
+    keys = ["/marked/", "/marked/tile/", "/marked/tile/cloud.laz"]
+    monkeypatch.setattr(type(files), "find", lambda *_: keys)
+    assert (here.pull_all() / "tile" / "cloud.laz").read_bytes() == b"points"
+    keys.pop()
+    with pytest.raises(InputError, match="is empty"):
+        here.pull_all()
+
+
+def test_killed_download_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    here, fetched = Remote("memory://kilometres", tmp_path / "cache"), list[str]()
+    for i in range(4):
+        files.pipe_file(f"/kilometres/{i}.laz", b"points")
+    get = type(files).get_file
+
+    def killed_at_the_third(self: object, source: str, *arguments: object, **options: object) -> None:
+        if len(fetched) == 2:
+            raise KeyboardInterrupt
+        fetched.append(source)
+        get(self, source, *arguments, **options)
+
+    monkeypatch.setattr(remote, "INDEX_INTERVAL_S", -1.0)
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(type(files), "get_file", killed_at_the_third)
+        here.pull_all()
+    fetched *= 2  # no more kills
+    monkeypatch.setattr(type(files), "get_file", killed_at_the_third)
+    here.pull_all()
+    assert [source.rpartition("/")[2] for source in fetched[4:]] == ["2.laz", "3.laz"]
+    (here.local / ".remote.json").write_text('{"0.la', encoding="utf-8")
+    assert (here.pull_all() / "3.laz").read_bytes() == b"points", "a damaged index is made again"
+
+
+def test_full_disk_of_the_local_copy_is_not_taken_for_the_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = pytest.importorskip("fsspec").filesystem("memory")
+    here = Remote("memory://full", tmp_path / "cache")
+    files.pipe_file("/full/cloud.laz", b"points")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as disk:
+        disk.setattr(type(files), "get_file", full)
+        with pytest.raises(SpaceError, match=f"{tmp_path / 'cache'}: no space left"):
+            here.pull(["cloud.laz"])
+    monkeypatch.setattr(Path, "mkdir", full)
+    with pytest.raises(SpaceError, match="no space left"):
+        here.pull(["new/cloud.laz"])
 
 
 def test_missing_or_unreadable_remote_files_are_reported(s3: str, tmp_path: Path) -> None:

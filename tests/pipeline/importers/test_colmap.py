@@ -89,6 +89,18 @@ def test_text_and_binary_give_the_same_tile(tmp_path: Path) -> None:
     assert np.array_equal(a.xyz, b.xyz) and np.array_equal(present(a.rgb), present(b.rgb))
 
 
+def test_photos_without_lines_of_observations_are_all_read(tmp_path: Path) -> None:
+    """Scripts and apps write images.txt without the (empty) second line of each photo."""
+    make_model(tmp_path, ["OPENCV", "PINHOLE", "PINHOLE"])
+    file = tmp_path / "txt" / "images.txt"
+    rows = [line for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("#") or ".png" in line]
+    before = read(tmp_path / "txt", Photos(tmp_path / "images"))
+    file.write_text("\n".join(rows), encoding="utf-8")
+    after = read(tmp_path / "txt", Photos(tmp_path / "images"))
+    assert [shot.file for shot in after.shots] == [shot.file for shot in before.shots] and len(after.shots) == 3
+    assert np.allclose(after.centres, before.centres)
+
+
 def test_sparse_points_keep_position_and_colour(tmp_path: Path) -> None:
     model, _ = make_model(tmp_path, ["PINHOLE"])
     tile = read_tile(import_model("colmap", tmp_path / "bin", tmp_path / "images", tmp_path / "tile"))

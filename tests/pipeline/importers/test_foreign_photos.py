@@ -148,3 +148,24 @@ def test_a_scaled_camera_projects_to_the_same_places() -> None:
 def test_an_exif_orientation_is_named(tmp_path: Path) -> None:
     _, notes = imported(recording(tmp_path, orientation=3), table())
     assert len(notes) == 1 and notes[0].startswith("2 photos (Straße_1.jpg, ...) have an EXIF orientation")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("#cameras 1\n#name,x,y,alt,heading,pitch,roll,f,px,py\na.jpg,1,2,3,0,0,0,24,0,0\n", "RealityCapture.*colmap"),
+        ("# Cameras (1)\n# PhotoID, X, Y, Z, Omega, Phi, Kappa, r11\na.jpg\t1\t2\t3\t0\t0\t0\t1\n", "import metashape"),
+        ("#Label,X/Longitude,Y/Latitude,Z/Altitude,Yaw\na.jpg,1,2,3,0\n", "reference.*import metashape"),
+        ("imageName X Y Z Omega Phi Kappa\na.jpg 1 2 3 0 0 0\n", "external camera parameters.*import pix4d"),
+    ],
+)
+def test_tables_of_poses_without_a_lens_are_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        imported(recording(tmp_path), text)
+
+
+def test_angles_in_gon_are_refused(tmp_path: Path) -> None:
+    head = "file,x,y,z,omega,phi,kappa,width,height,fx"
+    row = "photos/{},1,2,3,0.5,399.5,{},64,48,50"
+    with pytest.raises(InputError, match=r"row 2: an angle of 399\.5 is more than a full circle.*times 0\.9"):
+        imported(recording(tmp_path), "\n".join([head, *(row.format(name, 210) for name in NAMES)]))

@@ -12,6 +12,7 @@ from scan2sim.data_samples.mesh_model import TO_FILE, write
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.geometry.surface_distance import distances
+from scan2sim.pipeline.importers import mesh_model
 from scan2sim.pipeline.importers.mesh_model import import_mesh, sample
 from scan2sim.pipeline.importers.robot_map import MapParams
 from scan2sim.pipeline.io import clouds
@@ -46,6 +47,26 @@ def test_mesh_is_levelled_and_scaled_to_metres(tmp_path: Path, file_format: str,
     rgb = paint.at(points[floor].astype(np.float64), np.full(int(floor.sum()), 2))
     error = np.abs(rgb - present(cloud.rgb)[floor]).mean()
     assert error < (40 if file_format == "ply" else 8)
+
+
+def test_a_mesh_in_centimetres_is_doubted_unless_its_unit_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unreal, Blender and others write centimetres: a room of 2.7 m would be a hall of 270 m."""
+    monkeypatch.setattr(mesh_model, "POINTS", (20_000, 20_000))
+    path = write(tmp_path / "in", file_format="obj", edge=0.4, style=Style(rooms=1))[0]
+    lines = path.read_text(encoding="utf-8").splitlines()
+    scaled = [
+        " ".join(["v", *(f"{100 * float(v):.4f}" for v in line.split()[1:4])]) if line.startswith("v ") else line
+        for line in lines
+    ]
+    path.write_text("\n".join(scaled), encoding="utf-8")
+    doubts: dict[str, list[str]] = {}
+    for units in ("auto", "cm"):
+        warned: list[str] = []
+        import_mesh(path, tmp_path / units, MapParams.model_validate({"units": units}), warn=warned.append)
+        doubts[units] = [line for line in warned if "m high: if it isn't" in line]
+    assert len(doubts["auto"]) == 1 and "--units cm" in doubts["auto"][0] and not doubts["cm"]
 
 
 def test_samples_are_evenly_distributed() -> None:

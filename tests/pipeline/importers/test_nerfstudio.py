@@ -306,6 +306,16 @@ def test_frame_without_a_valid_pose_is_rejected(tmp_path: Path) -> None:
         read("nerfstudio", path, images())
 
 
+@pytest.mark.parametrize(
+    ("inside", "message"),
+    [("keyframes", "raw data of Polycam.*ns-process-data polycam"), ("sparse", "project of COLMAP.*import colmap")],
+)
+def test_captures_without_a_transforms_json_are_named(tmp_path: Path, inside: str, message: str) -> None:
+    (tmp_path / inside).mkdir()
+    with pytest.raises(InputError, match=message):
+        read("nerfstudio", tmp_path, tmp_path)
+
+
 def test_command_finds_photos_beside_the_file(tmp_path: Path) -> None:
     folder = copied(tmp_path / "data")
     files = {f"C:\\phone\\images\\{Path(name).stem}": pose for name, pose in shots()}  # no suffix, as by instant-ngp

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -177,6 +177,27 @@ def test_opensfm_model_is_placed_by_its_reference(tmp_path: Path, crs: str | Non
     assert np.abs(tile.frame.to_crs(cloud.xyz)[3] - on_earth(np.array([[3.0, 6.0, 3.0]]), code)).max() < 0.05
 
 
+@pytest.mark.parametrize("named", ["", "opensfm/reconstruction.json"])
+def test_projected_reconstruction_of_odm_is_not_taken_for_a_topocentric_one(tmp_path: Path, named: str) -> None:
+    """ODM's reconstruction.json is in the CRS minus an offset; photos are placed by the topocentric file beside it."""
+    folder = tmp_path / "opensfm"
+    (folder / "undistorted").mkdir(parents=True)
+    opensfm(folder / "reconstruction.topocentric.json", "brown", REFERENCE)
+    projected = opensfm(folder / "reconstruction.json", "brown", REFERENCE)
+    body = json.loads(projected.read_text(encoding="utf-8"))
+    for shot in body[1]["shots"].values():
+        shot["translation"][0] += 5
+    projected.write_text(json.dumps(body), encoding="utf-8")
+    (folder / "undistorted" / "reconstruction.json").write_bytes(projected.read_bytes())
+    tile = read_tile(import_model("opensfm", tmp_path / named, images(), tmp_path / "t"))
+    poses = {Path(name).stem: pose for name, pose in shots()}
+    for view in tile.views:
+        exact = on_earth(poses[view.photo.stem][None, :3, 3])
+        assert np.abs(tile.frame.to_crs(view.centre) - exact).max() < 0.01
+    with pytest.raises(InputError, match=r"undistorted photos, in projected coordinates.*topocentric\.json"):
+        read("opensfm", folder / "undistorted" / "reconstruction.json", images())
+
+
 # --- Metashape
 
 
@@ -325,6 +346,36 @@ def test_metashape_chunks_are_placed_by_their_transform(tmp_path: Path) -> None:
         import_model("metashape", path, images(), tmp_path / "c", cloud=cloud, gps=True)
 
 
+@pytest.mark.parametrize("bound", [False, True])
+def test_a_metashape_chunk_in_a_national_crs_is_geocentric_in_its_own_datum(tmp_path: Path, bound: bool) -> None:
+    """DHDN (Bessel's ellipsoid): read as WGS 84, heights would be 700 m off."""
+    cart = "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=bessel"
+    origin = np.array(Transformer.from_pipeline(cart).transform(9.0, 50.0, 200.0))
+    a, b = np.radians([50.0, 9.0])
+    R = np.array(
+        [[-np.sin(b), np.cos(b), 0], [-np.sin(a) * np.cos(b), -np.sin(a) * np.sin(b), np.cos(a)]]
+        + [[np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)]]
+    ).T
+    reference = CRS("EPSG:31467").to_wkt("WKT1_GDAL")
+    if bound:
+        shift = "TOWGS84[598.1,73.7,418.2,0.202,0.045,-2.455,6.7],"
+        at = reference.index('AUTHORITY["EPSG","6314"]')
+        reference = reference[:at] + shift + reference[at:]
+    path = metashape(tmp_path / "c.xml", "frame", BROWN, similarity(1.0, R, origin), reference)
+    cloud = tmp_path / "cloud.laz"
+    las.write(cloud, PointCloud(Frame(), np.ones((9, 3), np.float32)))
+    warned: list[str] = []
+    tile = read_tile(import_model("metashape", path, images(), tmp_path / "t", cloud=cloud, warn=warned.append))
+    back = f"+proj=pipeline +step +inv {cart.partition('+step ')[2].partition('+step ')[2]}"
+    back += " +step +proj=unitconvert +xy_in=rad +xy_out=deg"
+    poses = {Path(name).stem: pose for name, pose in shots()}
+    for view in tile.views:
+        lon, lat, height = Transformer.from_pipeline(back).transform(*(R @ poses[view.photo.stem][:3, 3] + origin))
+        east, north = Transformer.from_crs("EPSG:4314", "EPSG:31467", always_xy=True).transform(lon, lat)
+        assert np.abs(tile.frame.to_crs(view.centre) - [east, north, height]).max() < 0.01
+    assert not any("ellipsoid" in line for line in warned)
+
+
 # --- Bundler, VisualSFM
 
 
@@ -351,6 +402,20 @@ def test_points_of_bundler_project_to_their_pixels(tmp_path: Path) -> None:
     assert model.xyz.tolist() == [[1.5, 2.5, 3.5], [4, 5, 6]] and model.notes == (
         "1 photos without a pose are left out",
     )
+
+
+@pytest.mark.parametrize("name", ["bundle.list.txt", "bundle.out.list.txt", "imagelist.lst"])
+def test_list_of_bundler_has_the_name_of_any_program(tmp_path: Path, name: str) -> None:
+    path = bundler(tmp_path / "bundle", 500.0, -0.11, 0.02)
+    (path.parent / "list.txt").rename(path.parent / name)
+    assert len(read("bundler", path, images()).shots) == len(shots())
+
+
+def test_names_of_bundler_may_contain_blanks(tmp_path: Path) -> None:
+    path = bundler(tmp_path / "bundle", 500.0, -0.11, 0.02)
+    listed = (path.parent / "list.txt").read_text(encoding="utf-8")
+    (path.parent / "list.txt").write_text(listed.replace("./", "C:/my photos 2/"), encoding="utf-8")
+    assert len(read("bundler", path, images()).shots) == len(shots())
 
 
 def nvm(path: Path, f: float, r: float, fixed: str = "") -> Path:

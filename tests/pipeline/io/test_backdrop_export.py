@@ -12,11 +12,11 @@ import pytest
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.step import silent
-from scan2sim.pipeline.core.types import Mesh
+from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io import robot_formats, world_formats
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.world_formats import SceneParams
-from scan2sim.pipeline.io.worlds import sdf
+from scan2sim.pipeline.io.worlds import readme, sdf
 from scan2sim.pipeline.io.worlds.scene import BACKDROP, BACKDROP_PARTS, Scene, read_scene
 from scan2sim.pipeline.simulation.robot import ROBOT, Start
 from tests.fakes import synthetic
@@ -78,10 +78,45 @@ def test_files_without_the_backdrop_are_unchanged(town: Scene, tmp_path: Path) -
     without = exported(plain, "gazebo", tmp_path / "without")
     files = {path.relative_to(without) for path in without.rglob("*") if path.is_file()}
     more = {path.relative_to(with_it) for path in with_it.rglob("*") if path.is_file()} - files
-    assert more and all(path.name.startswith("backdrop") for path in more)
-    for file in files - {Path("metadata.json"), Path("models/tile0/model.sdf")}:
+    assert more and all("backdrop" in path.name for path in more)
+    for file in files - {Path("metadata.json"), Path("README.md"), Path("models/tile0/model.sdf")}:
         assert (with_it / file).read_bytes() == (without / file).read_bytes(), file
     assert "backdrop" not in json.loads((without / "metadata.json").read_text(encoding="utf-8"))
+
+
+def test_readme_says_what_a_users_own_sensors_need(town: Scene, tmp_path: Path) -> None:
+    text = (exported(town, "gazebo", tmp_path / "out") / "README.md").read_text(encoding="utf-8")
+    mask = int(text.split("<visibility_mask>")[1].split("<")[0])
+    assert mask & sdf.BACKDROP_FLAG == 0
+    (sky,) = (surface for surface in town.tiles[0].backdrop() if surface.name == "backdrop_sky")
+    assert float(text.split("<far>")[1].split("<")[0]) > np.linalg.norm(sky.shape.mesh.vertices, axis=1).max()
+    plain = exported(synthetic.scene(tmp_path / "plain", tiles=1), "gazebo", tmp_path / "without")
+    assert "visibility_mask" not in (plain / "README.md").read_text(encoding="utf-8")
+
+
+def test_readme_says_how_to_open_every_format(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=1)
+    for name in set(world_formats.format_names()) - {"opendrive"}:
+        readme.write(tmp_path, scene, [name])
+        text = (tmp_path / "README.md").read_text(encoding="utf-8")
+        assert "in this folder" in text and "{" not in text, name
+    readme.write(tmp_path, scene, ["gazebo"])
+    assert "NavSat" not in (tmp_path / "README.md").read_text(encoding="utf-8")
+    readme.write(tmp_path, replace(scene, frame=Frame()), ["gazebo"])
+    assert "NavSat sensors publish nothing" in (tmp_path / "README.md").read_text(encoding="utf-8")
+    command = f"GZ_SIM_RESOURCE_PATH=$PWD/models:$GZ_SIM_RESOURCE_PATH gz sim -r {scene.name}.sdf"
+    assert command in (tmp_path / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["gazebo", "glb", "usd"])
+def test_backdrop_can_be_omitted_for_depth_cameras(town: Scene, tmp_path: Path, name: str) -> None:
+    if missing := plugins.missing(world_formats.PACKAGE, name):
+        pytest.skip(f"{missing} is not installed")
+    world_formats.write(town, [name], tmp_path / "out", SceneParams(backdrop=False), silent)
+    assert not list((tmp_path / "out").rglob("*backdrop*"))
+    assert max(np.abs(part.corners).max() for part in READERS[name](tmp_path / "out", town)) < 55
+    assert "visibility_mask" not in (tmp_path / "out" / "README.md").read_text(encoding="utf-8")
+    assert town.has_backdrop
 
 
 @pytest.mark.parametrize("name", ["glb", "usd"])
@@ -94,4 +129,4 @@ def test_visual_formats_contain_the_backdrop(town: Scene, tmp_path: Path, name: 
 @pytest.mark.parametrize("name", ["mujoco", "urdf", "tiles3d"])
 def test_physics_and_tile_formats_omit_the_backdrop(town: Scene, tmp_path: Path, name: str) -> None:
     out = exported(town, name, tmp_path / "out")
-    assert not list(out.rglob("backdrop*"))
+    assert not list(out.rglob("*backdrop*"))

@@ -82,6 +82,26 @@ def write_e57(path: Path, cloud: PointCloud) -> None:
     file.close()
 
 
+def write_ptx(path: Path, cloud: PointCloud) -> None:
+    """Two scans in different axes, with beams without a return."""
+    from scipy.spatial.transform import Rotation
+
+    rows: list[str] = []
+    for some, angle in ((slice(0, 400), 0.3), (slice(400, None), -1.2)):
+        part, turn = cloud.take(some), Rotation.from_rotvec([0.1, angle, 0.2])
+        at = np.array(cloud.frame.origin) + [3.0, 2.0, 1.0]
+        own = turn.inv().apply(part.frame.to_crs(part.xyz) - at)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[3, :3] = turn.as_matrix().T, at  # of row vectors
+        rows += [str(len(part) // 2 + 1), "2", " ".join(map(repr, at.tolist())), "1 0 0", "0 1 0", "0 0 1"]
+        rows += [" ".join(map(repr, row)) for row in matrix.tolist()]
+        levels = present(part.intensity) / 65535
+        for place, level, rgb in zip(own, levels, present(part.rgb), strict=True):
+            rows.append(" ".join([*(f"{v:.5f}" for v in place), f"{level:.7f}", *map(str, rgb)]))
+        rows += 2 * ["0 0 0 0.5 0 0 0"]
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+
 def pcd(data: str, double: bool = True) -> Callable[[Path, PointCloud], None]:
     def write(path: Path, cloud: PointCloud) -> None:
         places = [(axis, "<f8" if double else "<f4") for axis in "xyz"]
@@ -240,6 +260,7 @@ FORMATS = {
         "c.ply", lambda p, c: write_ply(p, c, "binary_little_endian", "class"), 1e-5, ("rgb", "classification")
     ),
     "e57": Format("c.e57", write_e57, 2e-5, ("rgb", "intensity")),
+    "ptx": Format("c.ptx", write_ptx, 1e-4, ("rgb", "intensity")),
     "pcd ascii": Format("c.pcd", pcd("ascii"), 1e-5, MOST),
     "pcd binary": Format("c.pcd", pcd("binary"), 1e-5, MOST),
     "pcd binary_compressed": Format("c.PCD", pcd("binary_compressed"), 1e-5, MOST),

@@ -57,6 +57,10 @@ FILES: dict[str, tuple[str, str]] = {
         "a.txt", "".join(2 * (line + "\n") for line in lines(seconds, POSITIONS, XYZW, separator=" ").splitlines())
     ),
     "TUM with names": ("a.txt", "timestamp tx ty tz qx qy qz qw\n" + lines(seconds, POSITIONS, XYZW, separator=" ")),
+    "TUM, w first by its comment": (
+        "a.tum", "# poses\n# timestamp tx ty tz qw qx qy qz\n" + lines(seconds, POSITIONS, wxyz, separator=" ")
+    ),
+    "TUM, w first, tabs": ("a.txt", "#time,x,y,z,qw,qx,qy,qz\n" + lines(seconds, POSITIONS, wxyz, separator="\t")),
     "TUM in nanoseconds (ORB-SLAM3)": ("a.txt", lines(ns, POSITIONS, XYZW, separator=" ")),
     "TUM, Windows": ("a.txt", lines(seconds, POSITIONS, XYZW, separator="\t").replace("\n", "\r\n")),
     "EuRoC": ("data.csv", EUROC + lines(ns, POSITIONS, wxyz, zeros)),

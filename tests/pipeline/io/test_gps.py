@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from datetime import UTC, datetime
 from fractions import Fraction
@@ -75,6 +76,15 @@ def table(heading: str, delimiter: str = ",") -> str:
     return "\n".join([heading, *(delimiter.join(map(repr, row)) for row in points())])
 
 
+def scaled(heading: str, per_second: float, per_metre: float, *, swap: bool = False) -> str:
+    """A table with times and heights in other units: of drones' logs, or of a phone's sensors."""
+    rows = [
+        (f"{time * per_second:.0f}", *((lon, lat) if swap else (lat, lon)), f"{height * per_metre:.6f}")
+        for time, lat, lon, height in points()
+    ]
+    return "\n".join([heading, *(",".join(map(str, row)) for row in rows)])
+
+
 @pytest.mark.parametrize(
     ("name", "text", "sigma"),
     [
@@ -83,6 +93,9 @@ def table(heading: str, delimiter: str = ",") -> str:
         ("a.nmea", nmea(), 1.2),
         ("a.csv", table("timestamp,lat,lng,ele"), None),
         ("b.csv", table("Time (s); Latitude; Longitude; Altitude (m)", ";").replace(",", "."), None),
+        ("elevation.csv", table("time,latitude,longitude,elevation"), None),
+        ("airdata.csv", scaled("time(millisecond),latitude,longitude,altitude(feet)", 1e3, 1 / 0.3048), None),
+        ("phone.csv", scaled("time,longitude_deg,lat_deg,height_m", 1e9, 1, swap=True), None),
     ],
 )
 def test_all_formats_give_the_same_track(tmp_path: Path, name: str, text: str, sigma: float | None) -> None:
@@ -98,6 +111,14 @@ def test_all_formats_give_the_same_track(tmp_path: Path, name: str, text: str, s
     true = Geod(ellps="WGS84").inv(LON, LAT, LON + ALONG[-1], LAT)[2]
     assert track.distance(track.times[:1], track.times[-1:])[0] == pytest.approx(np.hypot(true, 7), rel=5e-4)
     assert track.sigma is None if sigma is None else np.allclose(present(track.sigma), sigma)
+
+
+def test_radians_are_read_by_their_unit(tmp_path: Path) -> None:
+    rows = [f"{time},{math.radians(lat)!r},{math.radians(lon)!r},{height}" for time, lat, lon, height in points()]
+    (tmp_path / "a.csv").write_text("\n".join(["time [s],lat [rad],lon [rad],alt [m]", *rows]), encoding="utf-8")
+    (tmp_path / "b.csv").write_text(table("time,lat,lon,alt"), encoding="utf-8")
+    a, b = gps.read(tmp_path / "a.csv"), gps.read(tmp_path / "b.csv")
+    assert a.frame == b.frame and np.allclose(a.positions, b.positions, atol=1e-6)
 
 
 def test_local_metres_are_kept_unchanged(tmp_path: Path) -> None:

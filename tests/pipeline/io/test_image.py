@@ -15,10 +15,12 @@ from scan2sim.pipeline.core.errors import InputError, UnavailableError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import U8, Camera, Frame, PointCloud, View
 from scan2sim.pipeline.io import views as views_io
-from scan2sim.pipeline.io.images import image
+from scan2sim.pipeline.io.images import exif, image
+from scan2sim.pipeline.io.images.decoders import heif
 from scan2sim.pipeline.steps.views import ViewsParams, views
 from tests.fakes.photo_files import ADOBE, P3, SRGB, decoded, encoded, profile, to_xyz, write
 from tests.fakes.steps import step_params
+from tests.present import present
 
 WIDTH, HEIGHT = 90, 70
 """No multiples of a tile's 16."""
@@ -190,3 +192,24 @@ def test_missing_library_is_reported(tmp_path: Path, rgb: U8, monkeypatch: pytes
     monkeypatch.setattr(importlib.util, "find_spec", lambda n, *more: None if n == "OpenImageIO" else real(n, *more))
     with pytest.raises(UnavailableError, match=r"a\.exr: needs OpenImageIO.*pip install OpenImageIO"):
         image.read_rgb(tmp_path / "a.exr")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pillow_heif") is None, reason="the extra heif isn't installed")
+def test_photo_of_an_iphone_is_read_upright_with_its_metadata(tmp_path: Path, rgb: U8) -> None:
+    heif.register()
+    taken = Image.fromarray(np.ascontiguousarray(np.rot90(rgb)))
+    tags = taken.getexif()
+    tags[274] = 6  # stored on its side
+    tags.get_ifd(0x8769).update({36867: "2026:05:01 12:00:00", 36881: "+02:00", 41989: 26})
+    tags.get_ifd(0x8825).update({1: "N", 2: (48.0, 8.0, 30.0), 3: "E", 4: (11.0, 34.0, 12.0)})
+    file = tmp_path / "IMG_0001.HEIC"
+    taken.save(file, format="HEIF", exif=tags.tobytes(), quality=-1, chroma=444)
+    assert image.size_of(file) == (WIDTH, HEIGHT)
+    image.check_decodes(file)
+    assert np.abs(image.read_rgb(file).astype(int) - rgb).mean() < 2
+    assert image.read_levels(file).shape == (HEIGHT, WIDTH)
+    assert (image.read_rgb(file, (10, 20, 50, 60)) == image.read_rgb(file)[20:60, 10:50]).all()
+    assert exif.orientation(file) == 1 and exif.focal_35mm(file) == 26
+    latitude, longitude, _ = present(exif.gps_position(file))
+    assert (latitude, longitude) == pytest.approx((48 + 8.5 / 60, 11.57), abs=1e-4)
+    assert exif.time_taken(file) == (1777629600.0, True)

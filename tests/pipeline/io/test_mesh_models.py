@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +15,7 @@ from scan2sim.data_samples.building import Style
 from scan2sim.data_samples.mesh_model import write
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64
+from scan2sim.pipeline.io import gltf_features
 from scan2sim.pipeline.io.mesh_files import companions, find_mesh, is_mesh
 from scan2sim.pipeline.io.mesh_models import read
 from scan2sim.pipeline.io.source_mesh import SourceMesh, Texels
@@ -179,3 +182,91 @@ def test_folder_with_two_meshes_names_them(tmp_path: Path) -> None:
     (tmp_path / "n.obj").write_bytes((tmp_path / "m.obj").read_bytes())
     with pytest.raises(InputError, match=r"m\.obj, n\.obj"):
         find_mesh(tmp_path)
+
+
+PLY_HEADER = """ply
+format ascii 1.0
+{textures}element vertex 4
+property float x
+property float y
+property float z
+element face 2
+property list uchar int vertex_indices
+property list uchar float texcoord
+{number}end_header
+0 0 0
+1 0 0
+1 1 0
+0 1 0
+"""
+
+
+def pages(folder: Path, numbers: tuple[str, str], textures: int = 2) -> Path:
+    """A PLY of a square as OpenMVS writes it: two triangles, each with the texture image of its number."""
+    for name, bgr in (("a 0.png", (0, 0, 200)), ("a 1.png", (0, 150, 0))):
+        cv2.imwrite(str(folder / name), np.full((8, 8, 3), bgr, np.uint8))
+    named = "".join(f"comment TextureFile a {i}.png\n" for i in range(textures))
+    number = "property int texnumber\n" if numbers[0] else ""
+    header = PLY_HEADER.format(textures=named, number=number)
+    faces = f"3 0 1 2 6 0 0 1 0 1 1 {numbers[0]}\n3 0 2 3 6 0 0 1 1 0 1 {numbers[1]}\n"
+    (folder / "m.ply").write_text(header + faces, encoding="utf-8")
+    return folder / "m.ply"
+
+
+def test_faces_of_a_ply_with_several_textures_get_their_own(tmp_path: Path) -> None:
+    path = pages(tmp_path, ("1", "0"))
+    mesh, notes = read(path)
+    assert not notes and len(mesh) == 2
+    left = mesh.mesh.corners[:, :, 0].mean(axis=1) < 0.5  # the second triangle of the file
+    assert centres(mesh)[left].tolist() == [[200, 0, 0]] and centres(mesh)[~left].tolist() == [[0, 150, 0]]
+    assert {file.name for file in companions(path)} == {"a 0.png", "a 1.png"}
+    (tmp_path / "a 1.png").unlink()
+    mesh, notes = read(path)
+    assert "a 1.png: not found" in notes[0] and mesh.coloured.sum() == 1
+
+
+def test_a_ply_with_several_textures_and_no_numbers_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"several texture images, but no `texnumber`.*as OBJ"):
+        read(pages(tmp_path, ("", "")))
+    mesh, _ = read(pages(tmp_path, ("", ""), textures=1))
+    assert centres(mesh).tolist() == [[200, 0, 0]] * 2
+
+
+TRANSFORM: dict[str, Any] = {"extensions": {"KHR_texture_transform": {"offset": [0.5, 0.0]}}}
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"extensionsRequired": ["EXT_meshopt_compression"]}, "compressed by meshoptimizer"),
+        ({"extensionsRequired": ["KHR_texture_basisu"]}, r"KTX 2.*JPEG or PNG"),
+        (
+            {"materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0} | TRANSFORM}}]},
+            "texture_transform",
+        ),
+        ({"materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"texCoord": 1}}}]}, "second set of texture"),
+        ({"accessors": [{"componentType": 5122, "normalized": True}]}, "POSITION as normalized integers"),
+    ],
+)
+def test_gltf_features_that_would_be_read_wrongly_are_refused(
+    tmp_path: Path, change: dict[str, Any], cause: str
+) -> None:
+    body = {
+        "asset": {"version": "2.0"},
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"componentType": 5126}],
+    }
+    (tmp_path / "m.gltf").write_text(json.dumps(body | change), encoding="utf-8")
+    content = json.dumps(body | change).encode()
+    glb = b"glTF" + (2).to_bytes(4, "little") + (20 + len(content)).to_bytes(4, "little")
+    (tmp_path / "m.glb").write_bytes(glb + len(content).to_bytes(4, "little") + b"JSON" + content)
+    for name in ("m.gltf", "m.glb"):
+        with pytest.raises(InputError, match=cause):
+            read(tmp_path / name)
+
+
+def test_a_texture_transform_that_changes_nothing_is_accepted(tmp_path: Path) -> None:
+    same = {"KHR_texture_transform": {"offset": [0, 0], "rotation": 0, "scale": [1, 1]}}
+    body = {"materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "extensions": same}}}]}
+    (tmp_path / "m.gltf").write_text(json.dumps(body), encoding="utf-8")
+    gltf_features.check(tmp_path / "m.gltf")

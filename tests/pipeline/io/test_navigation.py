@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import subprocess
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import cv2
@@ -200,6 +201,10 @@ def test_launch_file_publishes_the_frames(world: Path) -> None:
     assert np.allclose(odom[:3], about["position_m"])
     assert np.allclose(Rotation.from_quat(odom[3:]).as_euler("xyz"), about["angles_rad"], atol=1e-5)
     assert ("base_link", "robot/lidar_link/lidar") in transforms
+    # frame of Gazebo's images; RViz and image_proc take it for an optical one
+    image_frame = ET.parse(world / "models/robot/model.sdf").getroot().findtext(".//camera/optical_frame_id")
+    optical = transforms["base_link", str(image_frame)]
+    assert np.allclose(Rotation.from_quat(optical[3:]).apply([[1, 0, 0], [0, 0, 1]]), [[0, -1, 0], [1, 0, 0]])
 
 
 PARSE = """

@@ -47,6 +47,14 @@ def test_texture_coordinates_are_unique_with_v_upwards(tmp_path: Path) -> None:
         assert (v[at][2] > 0) == (float(vt[t].split()[2]) == 1.0)
 
 
+def test_materials_are_matt_for_gazebo(tmp_path: Path) -> None:
+    surface = present(textured_mesh.read(synthetic.textured(tmp_path / "in", synthetic.house())))
+    obj.write(tmp_path / "a.obj", surface, NAMES)
+    lines = (tmp_path / "a.mtl").read_text(encoding="utf-8").splitlines()
+    # gz-common reads a material without Pr as roughness 0, for which Ogre warns of NaNs in its shader
+    assert lines.count("Pr 1") == lines.count("Pm 0") == lines.count("Ks 0 0 0") == 2
+
+
 def test_normals_point_outwards(tmp_path: Path) -> None:
     surface = present(textured_mesh.read(synthetic.textured(tmp_path / "in", synthetic.ground())))
     assert surface.normal[:, 2].min() > 0.9

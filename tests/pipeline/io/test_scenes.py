@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +15,11 @@ import pytest
 
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.classes import CODE
-from scan2sim.pipeline.core.errors import InputError, ScanError
+from scan2sim.pipeline.core.errors import DataError, InputError, ScanError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame, Mesh
 from scan2sim.pipeline.io import world_formats
-from scan2sim.pipeline.io.world_formats import SceneParams, gazebo
+from scan2sim.pipeline.io.world_formats import SceneParams, carla, gazebo
 from scan2sim.pipeline.io.worlds import readme
 from scan2sim.pipeline.io.worlds.scene import Level, Scene, read_scene
 from tests.fakes import synthetic
@@ -265,14 +268,56 @@ def test_carla_names_carry_semantic_tags(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_no_two_textures_of_gazebos_world_have_the_same_file_name(tmp_path: Path) -> None:
+    # gz-rendering #139: the second would show the first
+    written(synthetic.scene(tmp_path), "gazebo", tmp_path / "out")
+    names = [path.name for path in (tmp_path / "out").rglob("*.png")]
+    assert len(names) == len(set(names)) and len(names) >= 8  # two tiles, two surfaces, two pages
+
+
+def test_worlds_of_reserved_names_are_rejected(tmp_path: Path) -> None:
+    scene = synthetic.scene(tmp_path, tiles=1)
+    for renamed in (replace(scene, name="world"), replace(scene, tiles=(replace(scene.tiles[0], name="world"),))):
+        with pytest.raises(DataError, match="reserved by simulators"):
+            world_formats.write(renamed, ["glb"], tmp_path / "out", SceneParams(), silent)
+    assert not (tmp_path / "out").exists()
+
+
+def test_carla_knows_the_tags() -> None:
+    # ATagger::GetLabelByFolderName of CARLA 0.9.15; a folder with another name has no label
+    labels = {
+        "Building", "Fence", "Pedestrian", "Pole", "Other", "Road", "RoadLine", "SideWalk", "TrafficSign", "Vegetation",
+        "Car", "Wall", "Sky", "Ground", "Bridge", "RailTrack", "GuardRail", "TrafficLight", "Static", "Dynamic",
+        "Water", "Terrain", "Truck", "Motorcycle", "Bicycle", "Bus", "Rider", "Train",
+    }  # fmt: skip
+    assert {*carla.PROP_TAGS.values(), carla.DEFAULT_TAG} <= labels
+    assert carla.PROP_TAGS[CODE["vehicle"]] == "Car"
+
+
 def test_large_ground_is_split_into_carla_map_tiles_from_the_north_west(tmp_path: Path) -> None:
     town = synthetic.scene(tmp_path, apart=3000.0)
     written(town, "carla", tmp_path / "out")
-    (about,) = json.loads((tmp_path / "out" / "carla" / "town.json").read_text(encoding="utf-8"))["maps"]
+    folder = tmp_path / "out" / "carla"
+    package, props = (json.loads((folder / f"{name}.json").read_text("utf-8")) for name in ("town", "town_props"))
+    # Import.py makes vertices of all files of a package with tiles relative to their tile
+    assert not package["props"] and len(props["props"]) == 4 and not props["maps"]
+    (about,) = package["maps"]
     assert about["tiles"] == ["./town/town_Tile_0_0.fbx", "./town/town_Tile_1_0.fbx"]
     (name, corners, _, picture), *_ = fbx(tmp_path / "out" / "carla" / "town" / "town_Tile_1_0.fbx")
     assert name.startswith("town_Terrain_tile1") and corners[..., 0].min() == pytest.approx(2990, abs=0.01)
     assert picture.parent.name == "town_Tile_1_0.fbm" and picture.is_file()
+
+
+def test_usd_files_have_a_version_that_isaac_sim_4_reads(tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    code = (
+        "from pathlib import Path; from scan2sim.pipeline.io.world_formats import usd; "
+        "stage = usd._stage(Path('a.usdc')); stage.GetRootLayer().Save()"
+    )
+    mine = {name: value for name, value in os.environ.items() if not name.startswith("USD_")}
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, env=mine)  # OpenUSD reads its settings once
+    head = (tmp_path / "a.usdc").read_bytes()
+    assert head[:8] == b"PXR-USDC" and tuple(head[8:11]) <= (0, 9, 0)
 
 
 def test_usd_contains_photo_and_distance_of_each_face(town: Scene, exported: dict[str, Path]) -> None:

@@ -63,6 +63,28 @@ def test_offset_is_written_to_the_pose(tmp_path: Path) -> None:
     assert world.findtext("include/pose") == "100.25 -3 0.001 0 0 0"
 
 
+def test_sensors_of_any_robot_have_their_systems(tmp_path: Path) -> None:
+    systems = {
+        present(plugin.get("name")).rsplit("::")[-1]: present(plugin.get("filename"))
+        for plugin in _world(tmp_path / "a.sdf", None).iter("plugin")
+    }
+    # names of libraries: gz-sim, src/systems/*/CMakeLists.txt, the same in Fortress 6.16 and in Jetty
+    assert systems == {
+        "Physics": "gz-sim-physics-system", "UserCommands": "gz-sim-user-commands-system",
+        "SceneBroadcaster": "gz-sim-scene-broadcaster-system", "Contact": "gz-sim-contact-system",
+        "Imu": "gz-sim-imu-system", "NavSat": "gz-sim-navsat-system", "Magnetometer": "gz-sim-magnetometer-system",
+        "Altimeter": "gz-sim-altimeter-system", "AirPressure": "gz-sim-air-pressure-system",
+        "ForceTorque": "gz-sim-forcetorque-system", "Sensors": "gz-sim-sensors-system",
+    }  # fmt: skip
+
+
+def test_commands_keep_the_users_own_models(tmp_path: Path) -> None:
+    _world(tmp_path / "a.sdf", None)
+    text = (tmp_path / "a.sdf").read_text(encoding="utf-8")
+    assert "GZ_SIM_RESOURCE_PATH=$PWD/models:$GZ_SIM_RESOURCE_PATH gz sim -r a.sdf" in text
+    assert "IGN_GAZEBO_RESOURCE_PATH=$PWD/models:$IGN_GAZEBO_RESOURCE_PATH ign gazebo -r a.sdf" in text
+
+
 def test_background_is_the_colour_of_the_sky(tmp_path: Path) -> None:
     sdf.write_world(tmp_path / "a.sdf", ["street"], None, (0.0, 0.0, 0.0), sky=(102, 153, 255))
     world = present(ET.parse(tmp_path / "a.sdf").getroot().find("world"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 from pathlib import Path
@@ -57,6 +58,19 @@ def test_spz_is_small(tmp_path: Path) -> None:
     for suffix in (".ply", ".spz"):
         splat_files.write(tmp_path / f"a{suffix}", some(20_000), np.zeros(3))
     assert (tmp_path / "a.spz").stat().st_size < 0.35 * (tmp_path / "a.ply").stat().st_size
+
+
+def test_viewers_know_the_layout_of_ply_and_the_version_of_spz(tmp_path: Path) -> None:
+    for suffix in (".ply", ".spz"):
+        splat_files.write(tmp_path / f"a{suffix}", some(), np.zeros(3))
+    head = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode()
+    names = [line.split()[2] for line in head.splitlines() if line.startswith("property float")]
+    # what SuperSplat, three.js and UnityGaussianSplatting need
+    needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    needed += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert [name for name in names if name not in ("nx", "ny", "nz")] == needed
+    content = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert content[:4] == b"NGSP" and struct.unpack_from("<I", content, 4) == (3,)
 
 
 @pytest.mark.parametrize(("away", "metres"), [(2040.0, 6e-4), (3000.0, 1e-3), (20_000.0, 5e-3)])

@@ -13,7 +13,7 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Camera, Frame, PointCloud
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
-from scan2sim.pipeline.io.tile import read_tile, write_tile
+from scan2sim.pipeline.io.tile import read_tile, tile_name, write_tile
 
 FT_CRS = "EPSG:2994"  # Oregon Lambert, international feet
 
@@ -49,6 +49,13 @@ def body(folder: Path, **changes: Any) -> dict[str, Any]:
 def save(folder: Path, content: dict[str, Any]) -> Path:
     (folder / "tile.toml").write_text(tomli_w.dumps(content), encoding="utf-8")
     return folder
+
+
+@pytest.mark.parametrize("name", ["world", "__street__"])
+def test_names_that_simulators_reserve_are_rejected(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="reserved by simulators"):
+        read_tile(save(tmp_path, body(tmp_path, name=name)))
+    assert tile_name(name) == {"world": "world_tile"}.get(name, "street")  # of a map "world.pcd", for example
 
 
 def test_written_tile_is_read_back_before_its_photos_exist(tmp_path: Path) -> None:

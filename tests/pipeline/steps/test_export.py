@@ -33,10 +33,8 @@ def _inputs(folder: Path, **meshes: Mesh) -> dict[str, Path]:
 def test_world_folder_contains_the_documented_files(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path).files["world"]
     meshes = "models/street/meshes"
-    groups = {
-        f"{meshes}/{group}{end}"
-        for group in ("terrain", "building")
-        for end in (".obj", ".mtl", ".dae", "_0.png", "_1.png")
+    groups = {f"{meshes}/{group}{end}" for group in ("terrain", "building") for end in (".obj", ".mtl", ".dae")} | {
+        f"{meshes}/street_{group}_{page}.png" for group in ("terrain", "building") for page in (0, 1)
     }
     kept = ("mesh.npz", "page_0.png", "page_1.png", "page_0_seen.png", "page_1_seen.png")
     assert _files(world) == groups | {
@@ -80,7 +78,7 @@ def test_large_group_is_split_without_losing_triangles(tmp_path: Path) -> None:
     model = ET.parse(world / "models/street/model.sdf").getroot()
     names = [visual.get("name") for visual in model.iter("visual")]
     assert names == ["terrain_part1", "terrain_part2", "terrain_part3", "terrain_part4", "building"]
-    assert len(list(world.rglob("terrain_*.png"))) == 2  # pages are shared by the parts
+    assert len(list(world.rglob("street_terrain_*.png"))) == 2  # pages are shared by the parts
 
 
 def test_metadata_contains_the_georeference(tmp_path: Path) -> None:
@@ -183,7 +181,7 @@ def test_export_is_deterministic(tmp_path: Path) -> None:
 def test_texture_pages_are_copied_unchanged(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path).files["world"]
     for page in (0, 1):
-        copy = world / f"models/street/meshes/terrain_{page}.png"
+        copy = world / f"models/street/meshes/street_terrain_{page}.png"
         assert copy.read_bytes() == (tmp_path / f"terrain/page_{page}.png").read_bytes()
         assert copy.stat().st_ino != (tmp_path / f"terrain/page_{page}.png").stat().st_ino  # may be edited freely
 
@@ -192,10 +190,9 @@ def test_texture_pages_are_converted_to_jpeg(tmp_path: Path) -> None:
     world = synthetic.world(tmp_path, pages="jpeg").files["world"]
     meshes = world / "models/street/meshes"
     assert not list(meshes.glob("*.png"))
-    assert "terrain_0.jpg" in (meshes / "terrain.mtl").read_text(encoding="utf-8") and "terrain_0.jpg" in (
-        meshes / "terrain.dae"
-    ).read_text(encoding="utf-8")
-    with Image.open(meshes / "terrain_0.jpg") as copy, Image.open(tmp_path / "terrain/page_0.png") as page:
+    for file in ("terrain.mtl", "terrain.dae"):
+        assert "street_terrain_0.jpg" in (meshes / file).read_text(encoding="utf-8")
+    with Image.open(meshes / "street_terrain_0.jpg") as copy, Image.open(tmp_path / "terrain/page_0.png") as page:
         assert copy.format == "JPEG" and copy.size == page.size
 
 

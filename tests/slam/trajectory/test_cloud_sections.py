@@ -18,6 +18,7 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.gps_time import clock_offsets
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.slam.trajectory import cloud_sections
+from tests.fakes import sbet
 from tests.fakes.two_passes import Passes, passes
 from tests.flows.inline_steps import inline_steps
 from tests.present import present
@@ -105,7 +106,35 @@ def test_reasons_why_a_cloud_is_not_checked_are_reported(drive: Passes, tmp_path
     drive.assemble(tmp_path, far)
     table = np.loadtxt(tmp_path / "path.csv", delimiter=",", skiprows=1)
     np.savetxt(tmp_path / "path.csv", table + [0, 0, 0, 800], "%.3f", ",", header="time,x,y,z", comments="")
-    assert "airborne cloud, or clocks that differ" in " ".join(imported(tmp_path)[0].split())
+    assert "802 m above the lowest ones beside it: an airborne cloud, or heights" in " ".join(
+        imported(tmp_path)[0].split()
+    )
+
+
+def test_heights_of_another_datum_are_reported(drive: Passes, tmp_path: Path) -> None:
+    drive.assemble(tmp_path, drive.truth)
+    table = np.loadtxt(tmp_path / "path.csv", delimiter=",", skiprows=1)
+    np.savetxt(tmp_path / "path.csv", table + [0, 0, 0, 30], "%.3f", ",", header="time,x,y,z", comments="")
+    output, check = imported(tmp_path)
+    assert "the trajectory is 31.8 m above the lowest points beside it" in " ".join(output.split())
+    assert check["scanner_height_m"] == pytest.approx(31.8, abs=0.1)
+
+
+def test_sbet_file_of_the_scanner_is_projected(drive: Passes, tmp_path: Path) -> None:
+    crs, origin, week = "EPSG:32632", np.array([458_000.0, 5_428_000.0, 100.0]), 2300 * 604_800.0 - 1e9
+    drive.assemble(tmp_path, drive.truth, clock_s=week, frame=Frame(crs, tuple(origin.tolist())))
+    poses = drive.truth.copy()
+    poses[:, :3, 3] += origin
+    sbet.write(tmp_path / "sbet.out", crs, drive.times, poses)
+    given = f"import clouds {tmp_path}/cloud.laz --trajectory {tmp_path}/sbet.out --out {tmp_path}"
+    for name, options in (("auto", ""), ("given", "--pose-source given")):
+        result = CliRunner().invoke(app, f"{given}/{name} {options}")
+        assert result.exit_code == 0, result.output
+        tile = read_tile(tmp_path / name)
+        path = present(tile.trajectory)
+        assert np.abs(path.positions + np.asarray(tile.frame.origin) - poses[:, :3, 3]).max() < 1e-3
+        assert np.allclose(path.times, drive.times + (week if name == "auto" else 0))
+        assert np.allclose(present(path.rotations), poses[:, :3, :3], atol=1e-4)
 
 
 def test_failing_check_of_a_cloud_costs_only_itself(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from scan2sim.pipeline.core.types import GpsTrack
-from scan2sim.slam.trajectory.gps import noise, smooth
+from scan2sim.slam.trajectory.gps import noise, smooth, video_clock
 
 
 def drive(error: float) -> tuple[GpsTrack, np.ndarray]:
@@ -44,3 +46,25 @@ def test_a_short_track_can_be_smoothed() -> None:
     assert np.allclose(smooth(two).positions, two.positions, atol=1e-3)
     one = GpsTrack(np.zeros(1), np.ones((1, 3)))
     assert np.allclose(smooth(one).positions, 1) and np.allclose(one.at([0.0]), 1) and noise(one) == 0
+
+
+NOON = 1_700_000_000.0
+
+
+@pytest.mark.parametrize(
+    ("start", "length", "first", "said"),
+    [
+        (NOON + 2.5 * 3600, 4 * 3600, 2.5 * 3600, None),  # long after the logger was switched on
+        (NOON - 20, 600, -20, None),  # before the first fix
+        (NOON + 2 * 3600 + 30, 600, 30, r"\+2 h from UTC"),  # a camera that writes local time
+        (NOON - 5e7, 600, 0, "isn't within the GPS track.*--gps-offset"),  # a camera whose clock was never set
+        (NOON + 7 * 3600, 4 * 3600, 0, "isn't within the GPS track"),  # several time zones are possible
+    ],
+)
+def test_video_clock_is_compared_with_the_track(start: float, length: float, first: float, said: str | None) -> None:
+    warnings: list[str] = []
+    times = NOON + np.arange(0.0, length, 10.0)
+    track = GpsTrack(times, np.column_stack([times - NOON, np.zeros((len(times), 2))]))
+    moved = video_clock(track, start, warnings.append)
+    assert moved.times[0] == pytest.approx(-first, abs=1e-6)
+    assert not warnings if said is None else re.search(said, warnings[0])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.camera.models import project
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of
+from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, has_only_projection, looks_rectified
 from scan2sim.pipeline.importers.bag.images import InvalidImage, compressed_file, raw_file
 
 RGB = np.zeros((16, 24, 3), np.uint8)
@@ -88,6 +88,19 @@ def test_compressed_images_are_copied_unchanged() -> None:
             compressed_file(SimpleNamespace(data=content, format="gif"))
 
 
+@pytest.mark.parametrize(("suffix", "codec"), [(".png", "png"), (".jpg", "jpeg")])
+def test_compressed_bayer_patterns_are_demosaiced(suffix: str, codec: str) -> None:
+    mosaic = np.full((16, 24), 40, np.uint8)
+    mosaic[::2, ::2] = 200  # red pixels of rggb
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 100] if codec == "jpeg" else []
+    content = cv2.imencode(suffix, mosaic, quality)[1].tobytes()
+    made, file = compressed_file(SimpleNamespace(data=content, format=f"bayer_rggb8; {codec} compressed "))
+    blue, green, red = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)[8, 8].astype(int)
+    assert made == ".png" and abs(red - 200) < 20 and abs(blue - 40) < 20 and abs(green - 40) < 20
+    for converted in (f"bayer_rggb8; {codec} compressed mono8", f"bayer_rggb8; {codec} compressed bgr8"):
+        assert compressed_file(SimpleNamespace(data=content, format=converted)) == (suffix, content)
+
+
 def info(model: str, D: list[float], **more: Any) -> Any:
     """A CameraInfo of ROS 2."""
     roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
@@ -120,6 +133,22 @@ def test_rectified_images_have_the_intrinsics_of_p() -> None:
     assert (camera.model, camera.fx, camera.cx, camera.distortion) == ("pinhole", 350, 330, ())
     plain = camera_of(info("plumb_bob", [0.0] * 5), rectified=False)
     assert (plain.model, plain.fx, plain.cy) == ("pinhole", 400, 240)
+
+
+def test_camera_without_k_has_that_of_p() -> None:
+    without = info("", [], k=[0.0] * 9)
+    assert has_only_projection(without) and not has_only_projection(info("", []))
+    camera = camera_of(without, rectified=True)
+    assert (camera.model, camera.fx, camera.cx, camera.distortion) == ("pinhole", 350, 330, ())
+
+
+def test_rectified_images_with_raw_intrinsics_are_recognized() -> None:
+    D, size = [-0.37, 0.2, 1e-3, 2e-3, -0.07], {"width": 1242, "height": 375}
+    K = [959.8, 0, 695.6, 0, 956.9, 224.2, 0, 0, 1]
+    P = [721.5, 0, 609.6, 44.9, 0, 721.5, 172.9, 0.2, 0, 0, 1, 0]
+    assert looks_rectified(info("plumb_bob", D, k=K, p=P, **size))
+    assert not looks_rectified(info("plumb_bob", D, k=K, p=P, width=1392, height=512))
+    assert not looks_rectified(info("plumb_bob", [0.0] * 5, k=P[:3] + P[4:7] + P[8:11], p=P, **size))
 
 
 def test_intrinsics_follow_binning_and_region_of_interest() -> None:

@@ -55,6 +55,17 @@ def test_poses_are_chained_from_moving_transforms() -> None:
     assert np.allclose(frames.poses_of("lidar", "odom")[1][:, 0, 3], [5.5, 10.5, 21.5, 35.5])
 
 
+def test_poses_are_not_held_while_a_link_is_missing() -> None:
+    frames = Frames(Path("drive.mcap"), {("base", "lidar"): pose(0)})
+    frames.moving["map", "odom"] = moving(*((0.05 * k, 0.0) for k in range(400)))  # goes on, as localizers do
+    frames.moving["odom", "base"] = moving(*((0.1 * k, float(k)) for k in range(150) if k < 40 or k > 90))
+    times, T = frames.poses_of("lidar", "map")
+    assert not ((times > 3.95) & (times < 9.05)).any() and times[-1] < 17.0
+    assert np.allclose(T[:, 0, 3], np.minimum(10 * times, 149))
+    frames.moving["map", "odom"] = moving((0.0, 0.0), (14.9, 0.5))  # rare corrections don't count as gaps
+    assert len(frames.poses_of("lidar", "map")[0]) == 99
+
+
 def test_world_frame_needs_a_moving_transform() -> None:
     frames = Frames(Path("drive.mcap"), {("map", "base"): pose(0), ("base", "lidar"): pose(1)})
     assert frames.world_frame("lidar") is None

@@ -160,7 +160,7 @@ def test_a_compressed_bag_that_is_larger_than_the_temporary_folder_is_reported(
 def test_pose_topics_are_used_only_if_chosen(tmp_path: Path, kind: str, form: str) -> None:
     path = write(bag_path(tmp_path, form), form, stamped(kind), points)
     with opened(path) as bag:
-        uses, _ = described(inspected(bag), BagParams())
+        uses, *_ = described(inspected(bag), BagParams())
     assert uses["/pose"] == "not used (--poses uses it)"
     found, notes = unpacked(path, tmp_path / "out", poses="/pose")
     assert found.poses is not None and notes == ["the poses of /pose are taken to be those of 'base' (--pose-frame)"]
@@ -202,7 +202,7 @@ def test_fixed_joints_of_a_urdf_complete_the_transforms(tmp_path: Path) -> None:
     assert found.photos is not None and notes == []
     assert np.allclose(read_rig(found.photos)[0].T_camera_scanner, np.linalg.inv(T_LIDAR_CAMERA))
     with opened(path) as bag:
-        uses, error = described(inspected(bag), BagParams(), robot)
+        uses, _, error = described(inspected(bag), BagParams(), robot)
     assert error is None and uses["/front/image_raw"].startswith("photos")
 
 
@@ -237,15 +237,16 @@ def test_invalid_urdf_is_rejected_with_its_cause(tmp_path: Path, text: str, mess
         read_fixed_joints(tmp_path / "r.urdf")
 
 
-def gnss(bag: BagFile, k: int, time: float) -> None:
+def gnss(bag: BagFile, k: int, time: float, wrong_deg: float = 0.0, sigma: float | None = 0.02) -> None:
     """An antenna 2 m behind the IMU, which is the vehicle's frame; grid north is not true north."""
     from pyproj import Proj, Transformer
 
     place = np.array([500_000 - 150_000.0, 5_400_000, 100])
     antenna = base(k)[:3, :3] @ [-2.0, 0, 0] + base(k)[:3, 3] + place
     lon, lat = Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True).transform(*antenna[:2])
-    bag.fix("/fix", time, "antenna", (lat, lon, antenna[2]), sigma=0.02)
-    turn = Rotation.from_euler("z", -Proj("EPSG:32633").get_factors(lon, lat).meridian_convergence, degrees=True)
+    bag.fix("/fix", time, "antenna", (lat, lon, antenna[2]), sigma=sigma)
+    convergence = Proj("EPSG:32633").get_factors(lon, lat).meridian_convergence
+    turn = Rotation.from_euler("z", wrong_deg - convergence, degrees=True)
     bag.imu("/imu", time, "base", turn.as_matrix() @ base(k)[:3, :3])
     if k == 0:
         T = np.eye(4)
@@ -317,7 +318,10 @@ def test_recording_times_replace_those_of_headers(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"/points at 0\.100 s has no time stamp in its header.*--stamps log"):
         unpacked(path, tmp_path / "a")
     found, _ = unpacked(path, tmp_path / "b", stamps="log")
-    assert list_files(found.sweeps)[2].stem == "1700000000.200000000"
+    third = list_files(found.sweeps)[2]
+    times = read_sweep(third).time
+    assert third.stem == "1700000000.200000000" and times is not None
+    assert np.allclose(times, START + 0.2 + OFFSETS - PERIOD, atol=1e-6)  # it was recorded after its last point
 
 
 def test_transforms_repeated_by_ros_1_are_static(tmp_path: Path) -> None:
@@ -362,7 +366,7 @@ def test_defaults_skip_non_sensor_topics_with_a_reason(tmp_path: Path) -> None:
         bag.write("/chatter", "std_msgs/String", time, data="hello")
 
     with opened(write(tmp_path / "bag", "mcap", tf, camera, points, others)) as bag:
-        uses, error = described(inspected(bag), BagParams())
+        uses, _, error = described(inspected(bag), BagParams())
     assert error is None
     for topic, text in {
         "/points": "sweeps; frame lidar, points with times", "/cloud_map": "in the frame map",
@@ -390,11 +394,13 @@ def raw(topic: str, kind: str) -> Writer:
 def test_packets_and_videos_are_named_with_what_to_do(tmp_path: Path, form: str) -> None:
     packets = raw("/velodyne_packets", "velodyne_msgs/msg/VelodyneScan")
     video = raw("/front/video", "foxglove_msgs/msg/CompressedVideo")
-    path = write(bag_path(tmp_path, form), form, tf, packets, video)
+    packed = raw("/rear/points/draco", "point_cloud_interfaces/msg/CompressedPointCloud2")
+    path = write(bag_path(tmp_path, form), form, tf, packets, packed, video)
     with opened(path) as bag:
-        uses, error = described(inspected(bag), BagParams())
+        uses, _, error = described(inspected(bag), BagParams())
     assert "raw packets of a lidar, whose driver makes PointCloud2" in uses["/velodyne_packets"]
     assert "republish it as CompressedImage" in uses["/front/video"]
+    assert "republish them as PointCloud2" in uses["/rear/points/draco"]
     assert error is not None and "/velodyne_packets has the lidar's raw packets: play the bag" in str(error)
 
 

@@ -25,7 +25,7 @@ from scan2sim.services.teleoperation.control.messages import Command
 from scan2sim.services.teleoperation.encoders import Decoder
 from scan2sim.services.teleoperation.settings import ReplayParams
 from scan2sim.services.teleoperation.station import replay
-from scan2sim.services.teleoperation.station.recorder import PREFIX, Recorder, read
+from scan2sim.services.teleoperation.station.recorder import PREFIX, Recorder, bag_name, read
 from scan2sim.services.teleoperation.station.web import record
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
 from tests.fakes.browser import chromium
@@ -143,6 +143,11 @@ def test_oldest_drives_are_deleted_beyond_the_limit(tmp_path: Path) -> None:
     stops = [one.content.stop for one in read(tmp_path) if one.topic == "/command"]
     assert stops[-1] == 119 and stops == list(range(stops[0], 120)) and stops[0] > 50, "the newest, without gaps"
     assert len(list(tmp_path.glob(f"{PREFIX}*"))) > 3 and recorder.dropped == 0
+
+
+def test_names_of_bags_are_in_order_of_time() -> None:
+    names = [bag_name(ms) for ms in range(58_990, 61_010)]  # into the next minute
+    assert names == sorted(set(names)) and names[1010] == "drive-19700101-000100-000"
 
 
 def test_missing_and_damaged_recordings_are_reported(tmp_path: Path) -> None:
