@@ -22,7 +22,8 @@ OUTPUT_STRIDE = 4
 """Probabilities are stored at 1/4 of the resolution at which photos are classified."""
 MAX_UPSCALING = 1.6
 """Largest factor by which photos are enlarged."""
-
+MIN_WARNED_SHARE = 0.03
+"""Share of the photos from which a label without a class is worth a warning."""
 SIDEWAYS_MIN = 0.5
 """Least cosine between a photo's plane and the vertical; cameras that look more steeply have no upright photo."""
 
@@ -59,6 +60,20 @@ class Classifier:
         self.classes = tuple(name for name, row in zip(CLASSES, self._merge, strict=True) if row.any())
         self.takes_channels = network.info.channels
         self.tile = MAX_TILE_PX
+        self._label_shares, self._tiles = np.zeros(len(index)), 0
+
+    def warnings(self) -> list[str]:
+        """What was assumed about the network's input, and labels without a class in the photos that it classified."""
+        found = [f"{self._network.info.name}: {self._network.info.assumed}"] if self._network.info.assumed else []
+        shares = np.where(self._merge.any(axis=0), 0.0, self._label_shares / max(self._tiles, 1))
+        frequent = [i for i in np.argsort(-shares).tolist() if shares[i] >= MIN_WARNED_SHARE]
+        if frequent:
+            names = ", ".join(f"{self._network.info.labels[i]} ({shares[i]:.0%})" for i in frequent[:8])
+            found.append(
+                f"{self._network.info.name}: labels of the photos that are no class and don't count: {names}. If they "
+                f"belong to a class, name them after it: {', '.join(CLASSES)}"
+            )
+        return found
 
     def probabilities(self, rgb: U8, camera: Camera, channels: U8 | None = None, turns: int = 0) -> U8:
         """(h, w, C) uint8 probabilities (255 for 1) by class of `CLASSES`, at 1/`OUTPUT_STRIDE` of `size`.
@@ -121,6 +136,8 @@ class Classifier:
 
         part = image[top : top + self.tile, left : left + self.tile]
         found = self._network.probabilities(part)
+        self._label_shares += found.mean(axis=(1, 2))
+        self._tiles += 1
         merged = np.tensordot(self._merge, found, axes=1).transpose(1, 2, 0)
         y, x = top // OUTPUT_STRIDE, left // OUTPUT_STRIDE
         h, w = (

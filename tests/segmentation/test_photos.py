@@ -124,6 +124,43 @@ def test_other_label_sets_are_mapped_by_name() -> None:
         map_labels(["cat", "dog"], "pets.onnx")
 
 
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ("Sky Building Pole Road Pavement Tree SignSymbol Fence Car Pedestrian Bicyclist",  # CamVid
+         "sky building pole road sidewalk high_vegetation road_sign wall_or_fence vehicle person person"),
+        ("construction--flat--road construction--structure--building object--traffic-sign--front human--person "
+         "object--vehicle--on-rails marking--general object--support--utility-pole nature--vegetation",  # Vistas
+         "road building road_sign person vehicle road pole high_vegetation"),
+        ("person traffic_light road pavement-merged building-other-merged tree-merged sky-other-merged wall-brick",
+         "person road_sign road sidewalk building high_vegetation sky wall_or_fence"),  # COCO panoptic
+        ("road ground smallpole garage gate vegetation", "road road pole building wall_or_fence high_vegetation"),
+    ],
+)  # fmt: skip
+def test_spellings_of_label_sets_are_known(names: str, expected: str) -> None:
+    assert [CLASSES[i] for i in map_labels(names.split(), "")] == expected.split()
+
+
+def test_labels_of_things_only_are_rejected() -> None:
+    """Networks for instances of COCO have five of our classes, but neither ground nor buildings."""
+    with pytest.raises(InputError, match="unknown label set"):
+        map_labels(["person", "bicycle", "car", "traffic light", "fire hydrant", "bench", "potted plant", "boat"], "")
+    with pytest.raises(InputError, match="unknown label set"):
+        map_labels(["sky", "building", "vegetation", "car"], "")
+
+
+def test_photos_that_show_labels_without_a_class_give_a_warning() -> None:
+    rgb, index = painted(PINHOLE)
+    network = ByColour(("road", "asphalt", "building", "sky", "car", "void", *["tree"] * 6))
+    classifier = Classifier(network, "")
+    classifier.probabilities(np.where(index[..., None] == 5, 20, rgb).astype(np.uint8), PINHOLE)
+    (warning,) = classifier.warnings()
+    assert "by colour: " in warning and "don't count: asphalt (17%). " in warning and "road, sidewalk" in warning
+    sure = Classifier(ByColour(), "")
+    sure.probabilities(rgb, PINHOLE)
+    assert sure.warnings() == []
+
+
 def test_all_labels_map_to_classes_and_codes_round_trip() -> None:
     assert all(ours in CLASSES for table in LABEL_SETS.values() for ours in table.values())
     assert index_of_code()[code_of_index()].tolist() == list(range(len(CLASSES)))
