@@ -61,6 +61,7 @@ from scan2sim.pipeline.steps.views import VIEWS
 from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.steps.walls import WALLS
+from scan2sim.segmentation.huggingface import network_files
 from scan2sim.segmentation.steps.instances import INSTANCES
 from scan2sim.segmentation.steps.label import LABEL
 from scan2sim.segmentation.steps.segment import SEGMENT
@@ -790,9 +791,9 @@ def check_here(settings: Settings) -> None:
 
 
 def _weights_input(settings: Settings) -> dict[str, Path | Output]:
-    """The user's weights file as an input, so that other weights change the cache key."""
+    """The user's weights, and the files beside them that a network reads, as inputs: part of the cache key."""
     weights = settings.params(LABEL).weights
-    return {"weights": weights} if weights and weights.is_file() else {}
+    return {f"weights.{i}": file for i, file in enumerate(network_files(weights) if weights else ())}
 
 
 def _segment_settings(settings: Settings) -> dict[str, Any]:

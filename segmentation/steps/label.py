@@ -76,7 +76,9 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report, parts:
     classifier = Classifier(network, str(params.weights or network.info.name))
     projector = cache(lambda: scan_projector(cloud, params.size, report) if classifier.takes_channels else None)
     info = network.info
-    own = [info.name, info.sha256, *([file_digest(inputs["cloud"]), params.size] if classifier.takes_channels else [])]
+    own: list[object] = [info.name, info.sha256]
+    own += [file_digest(path) for name, path in inputs.items() if name.startswith("weights")]
+    own += [file_digest(inputs["cloud"]), params.size] if classifier.takes_channels else []
     warnings = []
     for i, view in enumerate(views):
         report(0.2 + 0.8 * i / len(views), view.name)
@@ -95,13 +97,15 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report, parts:
             key = [*own, i, file_digest(view.photo), views_io.to_json(view, with_paths=False)]
             parts.provide(folder, [*key, turns] if turns else key, classify)
         except InputError as error:
+            if error.where == str(params.weights) and not any(folder.glob("*.npy")):
+                raise  # the network's fault, not the photo's
             warnings.append(f"{view.photo}: {error.cause}: not classified")
     about = {"network": info.name, "sha256": info.sha256, "licence": info.licence, "classes": classifier.classes}
     (folder / "network.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
     return Done(
         {"labels": folder},
         {"photos": len(views) - len(warnings), **about},
-        warnings,
+        [*classifier.warnings(), *warnings],
     )
 
 
@@ -133,4 +137,4 @@ def can_label(params: LabelParams) -> None:
         check(params.network, params.weights)
 
 
-LABEL = Step("label", 6, label, LabelParams, check=can_label, parts=True, memory=(1.5, 3))
+LABEL = Step("label", 7, label, LabelParams, check=can_label, parts=True, memory=(1.5, 3))
