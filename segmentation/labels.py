@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -92,6 +93,22 @@ LABEL_SETS: dict[str, dict[str, str]] = {
     ),
     "scan2sim": _class_by_label(**{name: name for name in CLASSES}),
 }  # fmt: skip
+
+
+def read_names(path: Path) -> list[str]:
+    """Label names of a text file, one per line.
+
+    Raises:
+        InputError: it can't be read, or a line is empty, which would shift the names after it.
+    """
+    remedy = "Name one label per line, in their order; void for one without a meaning"
+    try:
+        names = [line.strip() for line in path.read_text("utf-8-sig").rstrip().split("\n")]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(path, f"can't be read ({error})", remedy) from None
+    if not all(names):
+        raise InputError(path, f"line {names.index('') + 1} is empty", remedy)
+    return names
 
 
 def map_labels(names: Sequence[str], where: str) -> U8:

@@ -11,6 +11,7 @@ from typing import Any
 from scan2sim.pipeline.core.cores import available_cores
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.segmentation.huggingface import CONFIG, beside, label_names, read_json
+from scan2sim.segmentation.labels import read_names
 
 FLOATS = {"tensor(float)": "float32", "tensor(float16)": "float16"}
 """NumPy type by ONNX type of the supported inputs."""
@@ -99,17 +100,15 @@ def read_labels(path: Path, metadata: dict[str, str]) -> tuple[str, ...]:
     """
     label_file = path.with_suffix(".labels.txt")
     remedy = f'Name them in order of the channels: metadata "labels" as a JSON list, or {label_file.name}, one per line'
-    try:
-        names = metadata_value(metadata.get("labels"), None) or label_file.read_text("utf-8-sig").rstrip().split("\n")
-    except FileNotFoundError:
-        if found := config_labels(path):
-            return found
-        raise InputError(path, "no labels found for the network's classes", remedy) from None
-    except (OSError, ValueError) as error:
-        raise InputError(label_file, f"can't be read ({error})", remedy) from None
-    if not isinstance(names, list) or not all(isinstance(name, str) and name.strip() for name in names):
-        raise InputError(path, "labels are not a list of names", f"{remedy}; void for one without a meaning")
-    return tuple(name.strip() for name in names)
+    names = metadata_value(metadata.get("labels"), None)
+    if not names and label_file.is_file():
+        return tuple(read_names(label_file))
+    names = names or config_labels(path)
+    if names is None:
+        raise InputError(path, "no labels found for the network's classes", remedy)
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) and name for name in names):
+        raise InputError(path, "labels are not a list of names", remedy)
+    return tuple(names)
 
 
 def _threads() -> int:

@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from scan2sim.flows.commands.app import App, Config, Sets, TilePath, settings_of
-from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.commands.display import console, progress, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.run_with_progress import plan_and_run, show_warnings
 from scan2sim.flows.engine.lock import locked
@@ -259,6 +259,8 @@ def _pixel_iou(folder: Path, settings: Settings) -> dict[str, float]:
         labelled = truth != IGNORED
         known.append(truth[labelled])
         predicted.append(best[labelled])
+    for warning in classifier.warnings():
+        warn(warning)
     codes = code_of_index()
     codes[CLASSES.index("sky")] = 255  # not 0, which means unknown
     found = confusion(codes[np.concatenate(known)], codes[np.concatenate(predicted)]).iou
