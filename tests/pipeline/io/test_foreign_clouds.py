@@ -22,6 +22,7 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import geokeys
 from scan2sim.pipeline.io.geodata.area_of_use import misfit
+from scan2sim.pipeline.io.label_sets import parse_classes
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.ingest import IngestParams, TileFrame, ingest
 from tests.pipeline.io.test_cloud_formats import ept, write_pcd
@@ -504,6 +505,9 @@ def labelled(path: Path, fields: str, label: str, labels: np.ndarray) -> Path:
          {0: "unclassified", 1: "road", 4: "building", 6: "pole", 7: "vehicle"}),
         ("x_origin y_origin z_origin reflectance", "class", "Paris-Lille-3D",
          {0: "unclassified", 1: "terrain", 2: "building", 8: "vehicle", 9: "high_vegetation"}),
+        ("red green blue instance visible confidence", "semantic", "KITTI-360",
+         {0: "unclassified", 5: "unclassified", 7: "road", 8: "sidewalk", 11: "building", 17: "pole", 20: "road_sign",
+          21: "high_vegetation", 22: "terrain", 26: "vehicle", 35: "wall_or_fence", -1: "unclassified"}),
     ],
 )  # fmt: skip
 def test_labels_of_data_sets_are_mapped(
@@ -522,3 +526,28 @@ def test_labels_that_are_no_las_codes_are_unclassified_and_counted(tmp_path: Pat
     assert any("field `label` is read as LAS classes" in note for note in notes)
     assert any("1,500 points have classes that are no LAS codes" in note for note in notes)
     assert present(clouds.read(path, Frame()).classification)[:4].tolist() == [2, 6, 1, 1]
+
+
+def test_labels_of_a_named_data_set_are_mapped(tmp_path: Path) -> None:
+    """SemanticKITTI's 10 is a car, not LAS's rail; 11 a bicycle, not a road; codes that it doesn't have, no class."""
+    labels = np.resize([40, 48, 50, 70, 72, 80, 81, 10, 11, 18, 30, 99, 252], N)
+    path = labelled(tmp_path / "c.ply", "a", "label", labels)
+    _, warnings = ingested(tmp_path / "plain", [path], Frame())
+    assert any(
+        "They seem to be labels of SemanticKITTI: import with --classes SemanticKITTI" in one for one in warnings
+    )
+    table = clouds.code_table(path, parse_classes("semantickitti"))
+    expected = [
+        "road", "sidewalk", "building", "high_vegetation", "terrain", "pole", "road_sign", "vehicle", "vehicle",
+        "vehicle", "person", "unclassified", "vehicle", "unclassified",
+    ]  # fmt: skip
+    assert table[[*labels[:13], 2]].tolist() == [CODE[name] for name in expected]
+    assert parse_classes("65=noise") == {65: CODE["low_noise"]}
+    dales = clouds.code_table(path, parse_classes("DALES"))[[1, 2, 8, 11]]
+    assert dales.tolist() == [CODE[name] for name in ("terrain", "high_vegetation", "building", "unclassified")]
+
+
+def test_codes_of_a_survey_are_not_taken_for_a_data_set(tmp_path: Path) -> None:
+    path = labelled(tmp_path / "c.ply", "a", "label", np.resize([2, 5, 6, 70, 71], N))
+    _, warnings = ingested(tmp_path / "plain", [path], Frame())
+    assert any("survey's own" in one for one in warnings) and not any("SemanticKITTI" in one for one in warnings)
