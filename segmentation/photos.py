@@ -118,10 +118,11 @@ class Classifier:
         out = np.zeros((max(1, height // OUTPUT_STRIDE), max(1, width // OUTPUT_STRIDE), len(CLASSES)), np.float32)
         weight = np.zeros(out.shape[:2], np.float32)
         while True:
+            tile = self._tile_size(height, width)
             try:
-                for top in _starts(height, self.tile):
-                    for left in _starts(width, self.tile):
-                        self._add_tile(image, top, left, out, weight)
+                for top in _starts(height, tile[0]):
+                    for left in _starts(width, tile[1]):
+                        self._add_tile(image[top : top + tile[0], left : left + tile[1]], top, left, out, weight)
                 break
             except MemoryError:
                 if self.tile // 2 < MIN_TILE_PX:
@@ -130,11 +131,18 @@ class Classifier:
                 out[:], weight[:] = 0, 0
         return np.asarray(np.clip(out / np.maximum(weight, 1e-6)[..., None] * 255 + 0.5, 0, 255), np.uint8)
 
-    def _add_tile(self, image: U8, top: int, left: int, out: F32, weight: F32) -> None:
+    def _tile_size(self, height: int, width: int) -> tuple[int, int]:
+        """Height and width of the tiles of an image: of the network's proportions, if its input has a fixed size."""
+        fixed = self._network.info.size
+        if fixed is None:
+            return self.tile, self.tile
+        factor = min(self.tile / max(fixed), height / fixed[0], width / fixed[1])
+        return max(1, round(fixed[0] * factor)), max(1, round(fixed[1] * factor))
+
+    def _add_tile(self, part: U8, top: int, left: int, out: F32, weight: F32) -> None:
         """Add a tile's probabilities, with weights that fall towards its borders."""
         import cv2
 
-        part = image[top : top + self.tile, left : left + self.tile]
         found = self._network.probabilities(part)
         self._label_shares += found.mean(axis=(1, 2))
         self._tiles += 1
@@ -151,10 +159,11 @@ class Classifier:
 
 
 def _starts(length: int, tile: int) -> list[int]:
-    """First pixels of tiles that cover a length with at least `TILE_OVERLAP_PX`; multiples of `OUTPUT_STRIDE`."""
+    """First pixels of tiles that cover a length with an overlap; multiples of `OUTPUT_STRIDE`."""
     if length <= tile:
         return [0]
-    n = math.ceil((length - TILE_OVERLAP_PX) / (tile - TILE_OVERLAP_PX))
+    overlap = min(TILE_OVERLAP_PX, tile // 2)
+    n = math.ceil((length - overlap) / (tile - overlap))
     return [int((length - tile) * i / (n - 1)) // OUTPUT_STRIDE * OUTPUT_STRIDE for i in range(n)]
 
 

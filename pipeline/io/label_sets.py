@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.classes import CODE, FIRST_USER_CODE, UNCLASSIFIED, parse_mapping, unmapped_codes_warning
+from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.types import U8
 
 
@@ -103,10 +104,13 @@ def parse_classes(text: str) -> dict[int, int]:
     """Mapping of a survey's codes to ours: the name of a data set ("SemanticKITTI"), or "65=noise,200=5".
 
     Raises:
-        SettingError: as `classes.parse_mapping`, with the names.
+        SettingError: as `classes.parse_mapping`, or no data set has that name.
     """
-    sets = {_plain(one.name): one for one in LABEL_SETS}
-    return sets[_plain(text)].mapping() if _plain(text) in sets else parse_mapping(text)
+    named = next((one for one in LABEL_SETS if _plain(one.name) == _plain(text)), None)
+    if named is None and text and "=" not in text:
+        names = ", ".join(one.name for one in LABEL_SETS)
+        raise SettingError("classes", f"{text[:40]!r} is no known data set", f"Name one of {names}, or write 65=noise")
+    return named.mapping() if named else parse_mapping(text)
 
 
 def codes_warning(count: npt.NDArray[np.integer], table: U8) -> str:

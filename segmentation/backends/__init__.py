@@ -23,6 +23,7 @@ class NetworkInfo:
         licence: licence of the weights, as stated in the file.
         pixels_per_radian: angular resolution to which photos should be resampled; None: their own.
         channels: whether it takes `segmentation.lidar_channels`.
+        size: height and width of its input, if they are fixed.
         assumed: what was assumed about its input, as nothing states it; empty: nothing.
     """
 
@@ -32,6 +33,7 @@ class NetworkInfo:
     licence: str
     pixels_per_radian: float | None
     channels: bool = False
+    size: tuple[int, int] | None = None
     assumed: str = ""
 
 

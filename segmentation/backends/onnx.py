@@ -79,9 +79,11 @@ class Network:
         licence = meta.get("license") or "not stated"
         density = onnx_session.metadata_value(meta.get("pixels_a_radian"), None)
         resolution = None if density is None else float(numbers([density], 1, path)[0])
+        height, width = self._size
         self.info = NetworkInfo(
             f"{backend} ({path.name})", labels, onnx_session.digest(path), licence, resolution, takes_channels,
-            ASSUMED if assumed and self._type != "uint8" else "",
+            size=(height, width) if height and width else None,
+            assumed=ASSUMED if assumed and self._type != "uint8" else "",
         )  # fmt: skip
 
     def probabilities(self, seen: U8) -> F32:

@@ -58,6 +58,27 @@ def test_large_photos_are_classified_in_tiles_without_seams(camera: Camera) -> N
     assert len(network.seen) > 1 and max(max(size) for size in network.seen) <= classifier.tile
 
 
+@pytest.mark.parametrize(
+    ("size", "fixed", "tile"),
+    [
+        ((1920, 1080), (512, 1024), (768, 1536)),
+        ((1920, 1080), (512, 512), (1080, 1080)),
+        ((1080, 1920), (512, 1024), (540, 1080)),
+        ((300, 200), (1024, 2048), (150, 300)),
+        ((1920, 1080), None, (1080, 1536)),
+    ],
+)
+def test_tiles_have_the_proportions_of_a_fixed_input(
+    size: tuple[int, int], fixed: tuple[int, int] | None, tile: tuple[int, int]
+) -> None:
+    camera = Camera("pinhole", *size, 500.0, 500.0, (size[0] - 1) / 2, (size[1] - 1) / 2)
+    rgb, truth = painted(camera)
+    network = ByColour()
+    network.info = replace(network.info, size=fixed)
+    best, _ = class_map(Classifier(network, "").probabilities(rgb, camera), rgb.shape[:2])
+    assert set(network.seen) == {tile} and (best == truth).mean() > 0.9
+
+
 def test_tiles_are_reduced_when_memory_is_insufficient() -> None:
     rgb, truth = painted(PINHOLE)
     network = ByColour(memory=400 * 400)

@@ -542,7 +542,9 @@ def test_labels_of_a_named_data_set_are_mapped(tmp_path: Path) -> None:
         "vehicle", "person", "unclassified", "vehicle", "unclassified",
     ]  # fmt: skip
     assert table[[*labels[:13], 2]].tolist() == [CODE[name] for name in expected]
-    assert parse_classes("65=noise") == {65: CODE["low_noise"]}
+    assert parse_classes("65=noise") == {65: CODE["low_noise"]} and parse_classes("") == {}
+    with pytest.raises(SettingError, match="'KITTI' is no known data set.*KITTI-360, SemanticKITTI"):
+        parse_classes("KITTI")
     dales = clouds.code_table(path, parse_classes("DALES"))[[1, 2, 8, 11]]
     assert dales.tolist() == [CODE[name] for name in ("terrain", "high_vegetation", "building", "unclassified")]
 
