@@ -12,14 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scan2sim.pipeline.core.classes import UNCLASSIFIED
 from scan2sim.pipeline.core.errors import DataError
-from scan2sim.pipeline.core.types import U8, Bools
-from scan2sim.segmentation.labels import IGNORED, index_of_code, map_labels, read_names
+from scan2sim.pipeline.core.types import U8
+from scan2sim.segmentation.label_images import NAMES, read_classes
 from scan2sim.segmentation.lidar_channels import CHANNELS, DOWNSAMPLING
-
-NAMES = "labels.txt"
-"""File in a data set's folder with the names of the labels' values, one per line."""
 
 
 def pairs(folder: Path) -> list[tuple[Path, Path]]:
@@ -51,6 +47,11 @@ def split(found: Sequence[tuple[Path, Path]], share: float) -> tuple[list[tuple[
     return (training, validation) if training else (list(found), [])
 
 
+def names_of(truth: Path) -> Path:
+    """File with the names of the labels in a label image's data set."""
+    return truth.parent.parent / NAMES
+
+
 def read(image: Path, truth: Path) -> tuple[U8, U8]:
     """(H, W, 3) colours and (H, W) class indices, `IGNORED` for pixels without a class.
 
@@ -59,45 +60,10 @@ def read(image: Path, truth: Path) -> tuple[U8, U8]:
     """
     import cv2
 
-    bgr, classes = cv2.imread(str(image)), read_classes(truth)
+    bgr, classes = cv2.imread(str(image)), read_classes(truth, names_of(truth))
     if bgr is None or bgr.shape[:2] != classes.shape:
         raise DataError(truth, "its image can't be read, or their sizes differ", "Create both again")
     return np.asarray(bgr[..., ::-1], np.uint8), classes
-
-
-def read_classes(truth: Path) -> U8:
-    """(H, W) class indices of a label image, `IGNORED` for pixels without a class.
-
-    Raises:
-        DataError: it can't be read, has colours instead of indices, or values without a meaning.
-        InputError: `labels.txt` is invalid.
-    """
-    from PIL import Image
-
-    try:
-        with Image.open(truth) as file:
-            mode, values = file.mode, np.asarray(file)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DataError(truth, f"the label file can't be read ({error})", "Create it again") from None
-    remedy = f"Write one byte per pixel: a LAS code, {IGNORED} to ignore it, or the index of a line of {NAMES}"
-    if mode not in ("L", "P"):
-        raise DataError(truth, f"the label file has pixels of kind {mode}, not indices of classes", remedy)
-    table, known = _meaning(truth.parent.parent / NAMES)
-    unknown = np.flatnonzero(np.bincount(values.ravel(), minlength=256) * ~known).tolist()
-    if unknown:
-        named = ", ".join(map(str, unknown[:8]))
-        raise DataError(truth, f"values that are no classes of photos: {named}", f"{remedy}, which names all values")
-    return table[values]
-
-
-def _meaning(names: Path) -> tuple[U8, Bools]:
-    """(256,) class index of each value of a label image, `IGNORED` for none, and whether the value has a meaning."""
-    if not names.is_file():
-        table = index_of_code()
-        return table, (table != IGNORED) | np.isin(np.arange(256), (UNCLASSIFIED, IGNORED))
-    given = map_labels(read_names(names), str(names))
-    table = np.concatenate([given, np.full(256, IGNORED, np.uint8)])[:256]
-    return table, (np.arange(256) < len(given)) | (np.arange(256) == IGNORED)
 
 
 def read_channels(image: Path, size: tuple[int, int]) -> U8:

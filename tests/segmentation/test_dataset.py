@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from scan2sim.pipeline.core.errors import DataError, InputError
+from scan2sim.segmentation.label_images import read_classes
 from scan2sim.segmentation.labels import CLASSES, IGNORED
-from scan2sim.segmentation.training.dataset import pairs, read, read_classes
+from scan2sim.segmentation.training.dataset import names_of, pairs, read
 
 CITYSCAPES = (
     "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation", "terrain",
@@ -52,29 +53,29 @@ def test_labels_of_other_sets_are_read_by_their_names(tmp_path: Path, mode: str)
     truth = write(tmp_path, [0, 1, 2, 8, 10, 13, 255], mode)  # train ids of Cityscapes
     (tmp_path / "labels.txt").write_text("\n".join(CITYSCAPES) + "\n", encoding="utf-8")
     expected = ["road", "sidewalk", "building", "high_vegetation", "sky", "vehicle", None]
-    assert names(read_classes(truth)) == expected
+    assert names(read_classes(truth, names_of(truth))) == expected
     write(tmp_path, [0, 1, 2, 19], mode)
     with pytest.raises(DataError, match="no classes of photos: 19.*labels.txt"):
-        read_classes(truth)
+        read_classes(truth, names_of(truth))
     (tmp_path / "labels.txt").write_text("void\nwall\n\nbuilding", encoding="utf-8")
     with pytest.raises(InputError, match="line 3 is empty"):
-        read_classes(truth)
+        read_classes(truth, names_of(truth))
 
 
 def test_ids_of_other_sets_without_names_are_rejected(tmp_path: Path) -> None:
     truth = write(tmp_path, [0, 1, 2, 8, 10, 13, 255])
     with pytest.raises(DataError, match=r"no classes of photos: 8, 10, 13\. .*labels\.txt"):
-        read_classes(truth)
+        read_classes(truth, names_of(truth))
 
 
 @pytest.mark.parametrize("mode", ["RGB", "I;16", "1", "LA"])
 def test_images_of_colours_or_instances_are_rejected(tmp_path: Path, mode: str) -> None:
     with pytest.raises(DataError, match="not indices of classes"):
-        read_classes(write(tmp_path, [11, 0, 6], mode))
+        read_classes(write(tmp_path, [11, 0, 6], mode), tmp_path / "none")
 
 
 def test_damaged_label_file_is_rejected(tmp_path: Path) -> None:
     truth = write(tmp_path, [11, 0, 6])
     truth.write_bytes(truth.read_bytes()[:40])
     with pytest.raises(DataError, match="can't be read"):
-        read_classes(truth)
+        read_classes(truth, names_of(truth))
