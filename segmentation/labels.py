@@ -21,8 +21,10 @@ IGNORED = 255
 
 
 def code_of_index() -> U8:
-    """(12,) LAS codes of `CLASSES`; 0 for the sky."""
-    return np.array([CODE.get(name, 0) for name in CLASSES], np.uint8)
+    """(256,) LAS codes of `CLASSES`; 0 for the sky, and `IGNORED` for what is no index."""
+    table = np.full(256, IGNORED, np.uint8)
+    table[: len(CLASSES)] = [CODE.get(name, 0) for name in CLASSES]
+    return table
 
 
 def index_of_code() -> U8:

@@ -175,6 +175,8 @@ def _ramp(n: int) -> F32:
 def class_map(probabilities: U8, size: tuple[int, int]) -> tuple[U8, U8]:
     """(H, W) index of the most probable class of every pixel, and (H, W) its probability (255 for 1).
 
+    The index is `IGNORED` where labels without a class are more probable than all classes.
+
     Args:
         probabilities: (h, w, C) from `Classifier.probabilities`.
         size: (H, W) of the photo.
@@ -186,4 +188,6 @@ def class_map(probabilities: U8, size: tuple[int, int]) -> tuple[U8, U8]:
         layer = cv2.resize(probabilities[..., k], size[::-1], interpolation=cv2.INTER_LINEAR)
         better = layer > confidence
         best[better], confidence[better] = k, layer[better]
+    known = probabilities.sum(axis=2, dtype=np.float32)
+    best[cv2.resize(known, size[::-1], interpolation=cv2.INTER_LINEAR) < 127] = IGNORED
     return best, confidence

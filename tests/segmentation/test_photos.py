@@ -184,7 +184,15 @@ def test_photos_that_show_labels_without_a_class_give_a_warning() -> None:
 
 def test_all_labels_map_to_classes_and_codes_round_trip() -> None:
     assert all(ours in CLASSES for table in LABEL_SETS.values() for ours in table.values())
-    assert index_of_code()[code_of_index()].tolist() == list(range(len(CLASSES)))
+    indices = list(range(len(CLASSES)))
+    assert index_of_code()[code_of_index()[indices]].tolist() == indices and code_of_index()[IGNORED] == IGNORED
+
+
+def test_pixels_of_labels_without_a_class_have_none() -> None:
+    rgb, truth = painted(PINHOLE)
+    network = ByColour((*CLASSES[:5], "void", *CLASSES[6:]))
+    best, _ = class_map(Classifier(network, "").probabilities(rgb, PINHOLE), rgb.shape[:2])
+    assert (best == np.where(truth == 5, IGNORED, truth)).mean() > 0.95
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])
