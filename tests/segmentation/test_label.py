@@ -68,11 +68,11 @@ def test_unknown_labels_are_rejected_with_the_names_that_fit(inputs: dict[str, P
         run(inputs, weights)
 
 
-def labels(folder: Path, names: str = "", **images: np.ndarray) -> Path:
+def labels(folder: Path, images: dict[str, np.ndarray], names: str = "") -> Path:
     """Write label images, and `labels.txt` with these names."""
     folder.mkdir()
     for name, values in images.items():
-        path = folder / f"{name.replace('__', '/')}.png"
+        path = folder / f"{name}.png"
         path.parent.mkdir(exist_ok=True)
         cv2.imwrite(str(path), values.astype(np.uint8))
     if names:
@@ -99,7 +99,7 @@ def by_images(inputs: dict[str, Path], folder: Path) -> Done:
 
 def test_label_images_replace_the_network(inputs: dict[str, Path], tmp_path: Path) -> None:
     names = "road building vegetation void sky"
-    done = by_images(inputs, labels(tmp_path / "masks", names, **{"0": TRUTH, "1": TRUTH[:, ::-1]}))
+    done = by_images(inputs, labels(tmp_path / "masks", {"0": TRUTH, "1": TRUTH[:, ::-1]}, names))
     assert best_of(done, 0) == ["road", "building", "high_vegetation", ""]
     assert best_of(done, 1) == ["", "high_vegetation", "building", "road"]
     assert done.metrics["photos"] == 2 and not done.warnings
@@ -107,7 +107,7 @@ def test_label_images_replace_the_network(inputs: dict[str, Path], tmp_path: Pat
 
 
 def test_label_images_without_names_are_las_codes(inputs: dict[str, Path], tmp_path: Path) -> None:
-    done = by_images(inputs, labels(tmp_path / "masks", **{"0": LAS_TRUTH}))
+    done = by_images(inputs, labels(tmp_path / "masks", {"0": LAS_TRUTH}))
     assert best_of(done, 0) == ["road", "building", "high_vegetation", "sky"]
     assumed, missing = done.warnings
     assert "read as LAS codes (11 road, 6 building" in assumed and "labels.txt" in assumed
@@ -125,21 +125,21 @@ def test_unsuitable_label_images_are_rejected(
     inputs: dict[str, Path], tmp_path: Path, images: dict[str, np.ndarray], error: type[Exception], cause: str
 ) -> None:
     with pytest.raises(error, match=cause):
-        by_images(inputs, labels(tmp_path / "masks", **images))
+        by_images(inputs, labels(tmp_path / "masks", images))
 
 
 def test_label_image_of_a_crop_is_left_out(inputs: dict[str, Path], tmp_path: Path) -> None:
-    done = by_images(inputs, labels(tmp_path / "masks", **{"0": LAS_TRUTH[:12], "1": LAS_TRUTH}))
+    done = by_images(inputs, labels(tmp_path / "masks", {"0": LAS_TRUTH[:12], "1": LAS_TRUTH}))
     assert done.metrics["photos"] == 1 and "24 x 12 pixels don't have the proportions" in done.warnings[1]
 
 
 def test_photos_of_several_cameras_have_label_images_in_folders(tmp_path: Path) -> None:
     camera = Camera("pinhole", 64, 48, 50.0, 50.0, 31.5, 23.5)
     views = [View(f"photos/{side}/1", camera, np.eye(4), tmp_path / "1.jpg") for side in ("left", "right")]
-    folder = labels(tmp_path / "a", left__1=LAS_TRUTH, right__1=LAS_TRUTH)
+    folder = labels(tmp_path / "a", {"left/1": LAS_TRUTH, "right/1": LAS_TRUTH})
     assert [path.parent.name for path in LabelImages(folder, views).files.values()] == ["left", "right"]
     with pytest.raises(InputError, match="label image of 2 photos"):
-        LabelImages(labels(tmp_path / "b", **{"1": LAS_TRUTH}), views)
+        LabelImages(labels(tmp_path / "b", {"1": LAS_TRUTH}), views)
 
 
 def test_files_beside_the_weights_are_inputs_of_the_step(tmp_path: Path) -> None:
@@ -163,7 +163,7 @@ def test_files_beside_the_weights_are_inputs_of_the_step(tmp_path: Path) -> None
 def test_label_images_are_inputs_of_the_step(tmp_path: Path) -> None:
     tile = read_tile(ROOT / "data_samples" / "tile")
     stem = Path(tile.views[0].name).name
-    folder = labels(tmp_path / "masks", "road sky building car", **{stem: LAS_TRUTH, "other": LAS_TRUTH})
+    folder = labels(tmp_path / "masks", {stem: LAS_TRUTH, "other": LAS_TRUTH}, "road sky building car")
     tasks = build_graph(tile, Settings({"label": {"images": str(folder)}}))
     (label,) = (task for task in tasks if task.step is LABEL)
     assert {folder / f"{stem}.png", folder / "labels.txt"} <= set(label.inputs.values())
