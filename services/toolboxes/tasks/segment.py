@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,8 @@ from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body, Segmentation
 from scan2sim.services.toolboxes.settings import ToolboxParams
 from scan2sim.services.toolboxes.tasks import PostProcessor
+
+log = logging.getLogger(__name__)
 
 NEEDS = ("cv2", "onnxruntime")
 OVERLAY_OPACITY = 0.55
@@ -91,6 +94,8 @@ class Segmenter:
         path = _weights(params)
         network = backends.load(params.network, path, params.device)
         self._classifier, self._params = Classifier(network, str(path or OWN_NETWORK)), params
+        for warning in self._classifier.warnings():
+            log.warning("%s", warning)
         self.info = ModelInfo(network.info.name, CLASSES, network.info.sha256, network.info.licence)
 
     def __call__(self, images: Sequence[U8]) -> list[Body]:
