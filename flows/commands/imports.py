@@ -104,6 +104,10 @@ def import_kitti_sequence(
     pose_source: PoseSource = "auto",
     max_range: MaxRange = 50.0,
     vertical_angle_offset: VerticalAngleOffset = 0.0,
+    labels: Annotated[
+        Path | None,
+        typer.Option(help="Folder of labels (NNNNNN.label) of SemanticKITTI, or predicted in its format: classes."),
+    ] = None,
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
@@ -118,7 +122,7 @@ def import_kitti_sequence(
     with progress("import") as report:
         path = kitti.import_kitti_odometry(
             sequence, out, poses=poses, cameras=camera or ["image_2"], max_range=max_range, name=name, link=link,
-            vertical_angle_offset=vertical_angle_offset, pose_source=source, trajectory_check=check,
+            vertical_angle_offset=vertical_angle_offset, labels=labels, pose_source=source, trajectory_check=check,
             overwrite=overwrite, warn=warnings.append, report=report,
         )  # fmt: skip
         report(1.0, CHECKING_PHOTOS)

@@ -23,7 +23,7 @@ class LabelSet(NamedTuple):
 
     def codes(self, labels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Our class codes (N,) of labels (N,); unclassified where a label isn't known."""
-        table = np.full(256, UNCLASSIFIED, np.int64)
+        table = np.full(max(self.classes) + 1, UNCLASSIFIED, np.int64)
         for label, name in self.classes.items():
             table[label] = CODE[name]
         known = np.isin(labels, list(self.classes))
@@ -32,7 +32,7 @@ class LabelSet(NamedTuple):
     def mapping(self) -> dict[int, int]:
         """Our code of each label, and "unclassified" for codes that mean something else in LAS."""
         las = {code: UNCLASSIFIED for code in CODE.values() if code < FIRST_USER_CODE}
-        return las | {label: CODE[name] for label, name in self.classes.items()}
+        return las | {label: CODE[name] for label, name in self.classes.items() if label < 256}
 
 
 def _labels(**labels: tuple[int, ...]) -> dict[int, str]:
@@ -44,8 +44,8 @@ SEMANTIC_KITTI = LabelSet(  # Behley et al., "SemanticKITTI", ICCV 2019
     "SemanticKITTI",
     _labels(
         road=(40, 44, 60), sidewalk=(48,), terrain=(49, 72), building=(50, 52), wall_or_fence=(51,),
-        high_vegetation=(70, 71), pole=(80,), road_sign=(81,), vehicle=(10, 11, 13, 15, 16, 18, 20, 252),
-        person=(30, 31, 32, 253, 254, 255), unclassified=(99,),
+        high_vegetation=(70, 71), pole=(80,), road_sign=(81,), unclassified=(99,),
+        vehicle=(10, 11, 13, 15, 16, 18, 20, 252, 256, 257, 258, 259), person=(30, 31, 32, 253, 254, 255),
     ),
 )  # fmt: skip
 LABEL_SETS = (
@@ -117,7 +117,7 @@ def codes_warning(count: npt.NDArray[np.integer], table: U8) -> str:
     """`classes.unmapped_codes_warning`, which names SemanticKITTI if the codes seem to be its labels."""
     warning = unmapped_codes_warning(count, table)
     labelled = np.delete(count, [0, UNCLASSIFIED])
-    known = count[list(SEMANTIC_KITTI.classes)].sum()
+    known = count[[label for label in SEMANTIC_KITTI.classes if label < 256]].sum()
     ground, plants = count[[40, 44, 48, 49, 72]].sum(), count[[70, 71]].sum()
     if not warning or known < MIN_KNOWN_SHARE * labelled.sum() or not (ground and plants):
         return warning
