@@ -51,10 +51,8 @@ class Sweep(NamedTuple):
 
     def take(self, keep: Bools) -> Sweep:
         """The points selected by a mask (N,)."""
-        rgb, time, classification = (
-            None if column is None else column[keep] for column in (self.rgb, self.time, self.classification)
-        )
-        return Sweep(self.xyz[keep], self.intensity[keep], rgb, time, classification)
+        columns: Any = (None if column is None else column[keep] for column in self)
+        return Sweep(*columns)
 
 
 def list_files(folder: Path, suffixes: Sequence[str] = SWEEP_SUFFIXES, what: str = "sweeps") -> list[Path]:
