@@ -175,7 +175,8 @@ def _probabilities(found: list[npt.NDArray[Any]], labels: int) -> F32 | None:
         shares = 1 / (1 + np.exp(-masks[0].astype(np.float32)))
         return _scaled(np.einsum("qc,qhw->chw", classes, shares, optimize=True))
     if out.dtype.kind in "iu":
-        index = out[:, 0] if out.ndim == 4 and out.shape[1] == 1 else out[..., 0] if out.ndim == 4 else out
+        single = 1 if out.ndim == 4 and out.shape[1] == 1 else 3 if out.ndim == 4 and out.shape[3] == 1 else None
+        index = out if single is None else out.squeeze(single)
         fits = index.ndim == 3 and ((index < labels) | (index == IGNORED)).all()
         return (np.arange(labels)[:, None, None] == index[0]).astype(np.float32) if fits else None
     if out.ndim == 4 and out.shape[1] != labels:

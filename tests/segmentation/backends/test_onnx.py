@@ -255,6 +255,15 @@ def test_indices_of_labels_are_read(tmp_path: Path, axis: int, keep: int, kind: 
     assert (found.argmax(axis=0) == reference(photo()).argmax(axis=0)).all()
 
 
+def test_integers_for_each_label_are_no_indices(tmp_path: Path) -> None:
+    """A quantized softmax, whose values aren't scaled back."""
+    nodes = [conv(), onnx.helper.make_node("Softmax", ["logits"], ["shares"], axis=1)]
+    nodes += [onnx.helper.make_node("Cast", ["shares"], ["output"], to=2)]
+    network = load("onnx", graph(tmp_path / "n.onnx", nodes, IMAGE, {"output": (2, [1, 4, "a", "b"])}), "cpu")
+    with pytest.raises(InputError, match=r"output of uint8 \(1, 4, 16, 24\)"):
+        network.probabilities(photo())
+
+
 @pytest.mark.parametrize(("shift", "fits"), [(0, True), (252, True), (2, False)])
 def test_indices_without_a_label_are_rejected_unless_they_are_255(tmp_path: Path, shift: int, fits: bool) -> None:
     nodes = [conv(), onnx.helper.make_node("ArgMax", ["logits"], ["best"], axis=1, keepdims=0)]
