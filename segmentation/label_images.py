@@ -12,6 +12,7 @@ from scan2sim.pipeline.core.classes import UNCLASSIFIED
 from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.types import U8, Bools, View
 from scan2sim.pipeline.io.images.image import SUFFIXES
+from scan2sim.pipeline.io.tile_folder import without_parents
 from scan2sim.segmentation.labels import CLASSES, IGNORED, index_of_code, map_labels, read_names
 from scan2sim.segmentation.photos import OUTPUT_STRIDE
 
@@ -68,7 +69,8 @@ class LabelImages:
 
 def _file_of(folder: Path, name: str) -> Path | None:
     """The label image of a photo: by its name with as many of its folders as there are."""
-    stem = Path(name).with_suffix("") if Path(name).suffix.lower() in SUFFIXES else Path(name)
+    path = Path(without_parents(name))
+    stem = path.with_suffix("") if path.suffix.lower() in SUFFIXES else path
     candidates = (folder / Path(*stem.parts[i:-1]) / f"{stem.name}.png" for i in range(len(stem.parts)))
     return next((file for file in candidates if file.is_file()), None)
 

@@ -70,9 +70,10 @@ def label(inputs: Inputs, params: LabelParams, out: Path, report: Report, parts:
     cloud = PointCloud.load(inputs["cloud"])
     kept = not params.context.overwrite and classified(cloud.classification) >= params.context.min_classified
     if kept or not views or not params.context.photos:
-        return Done(
-            {"labels": folder}, {"photos": 0, "why": "the cloud keeps its classes" if kept else "photos are not used"}
-        )
+        why = "the cloud keeps its classes" if kept else "photos are not used"
+        given = params.images or params.weights
+        ignored = f"{given} isn't used: {why}; --set segment.overwrite=true classifies the points by the photos"
+        return Done({"labels": folder}, {"photos": 0, "why": why}, [ignored] if kept and views and given else [])
     source = _Images(params.images, views) if params.images else _Network(inputs, params, cloud, report)
     warnings = []
     for i, view in enumerate(views):

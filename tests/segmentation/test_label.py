@@ -133,6 +133,21 @@ def test_label_image_of_a_crop_is_left_out(inputs: dict[str, Path], tmp_path: Pa
     assert done.metrics["photos"] == 1 and "24 x 12 pixels don't have the proportions" in done.warnings[1]
 
 
+def test_label_images_that_the_clouds_classes_replace_are_a_warning(inputs: dict[str, Path], tmp_path: Path) -> None:
+    PointCloud(Frame(), np.zeros((1, 3), np.float32), classification=np.array([6], np.uint8)).save(inputs["cloud"])
+    done = by_images(inputs, labels(tmp_path / "masks", {"0": LAS_TRUTH}))
+    (warning,) = done.warnings
+    assert "masks isn't used: the cloud keeps its classes" in warning and "segment.overwrite=true" in warning
+
+
+def test_photos_outside_of_the_tile_are_not_taken_for_their_label_images(tmp_path: Path) -> None:
+    camera = Camera("pinhole", 64, 48, 50.0, 50.0, 31.5, 23.5)
+    folder = labels(tmp_path / "masks", {"1": LAS_TRUTH})
+    photo = labels(tmp_path / "photos", {"1": LAS_TRUTH}) / "1.png"
+    for name in ("../photos/1", str(photo.with_suffix(""))):
+        assert LabelImages(folder, [View(name, camera, np.eye(4), photo)]).files == {name: folder / "1.png"}
+
+
 def test_photos_of_several_cameras_have_label_images_in_folders(tmp_path: Path) -> None:
     camera = Camera("pinhole", 64, 48, 50.0, 50.0, 31.5, 23.5)
     views = [View(f"photos/{side}/1", camera, np.eye(4), tmp_path / "1.jpg") for side in ("left", "right")]
