@@ -113,7 +113,8 @@ def show_findings(done: Mapping[str, Manifest]) -> list[str]:
         lines.append(f"warning: {text}")
         warn(text)
     if len(all_findings) > MAX_FINDINGS:
-        lines.append(f"{len(all_findings) - MAX_FINDINGS} more findings in the report")
+        rest = len(all_findings) - MAX_FINDINGS
+        lines.append(f"{rest} more finding{'s' if rest > 1 else ''} in the report")
         console.print(f"[dim]{lines[-1]}")
     return lines
 

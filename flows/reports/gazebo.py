@@ -32,7 +32,9 @@ def commands(sdf: Path) -> dict[str, str]:
 
 def lines(sdf: Path) -> list[str]:
     """Lines printed at the end of a run: path of the world, commands that open it in a browser, Gazebo and ROS 2."""
-    installed = "ign gazebo" if shutil.which("ign") else "gz sim"
+    ign = shutil.which("ign")
+    # from Garden on, `ign` is a link to `gz`
+    installed = "ign gazebo" if ign and Path(ign).resolve().name != "gz" else "gz sim"
     by_release = commands(sdf)
     folder = sdf.parent
     world = [f"World:  {folder}", f"View:   {_command()} view {shlex.quote(str(folder))}"] if folder.is_dir() else []

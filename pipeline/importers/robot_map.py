@@ -37,7 +37,7 @@ from scan2sim.pipeline.robot_maps.label_colours import (
 )
 from scan2sim.pipeline.robot_maps.outliers import below_floor, far_outliers
 
-VERSION = 6
+VERSION = 7
 """Version of the importer: raised when the same input and options give another tile."""
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 MIN_TILT_DEG = 0.5
@@ -306,21 +306,35 @@ def level_rotation(xyz: F32, params: MapParams, origin: F64, warn: Callable[[str
         warn(
             "the up axis is ambiguous: check the world, and if it lies on its side or its head, name the axis with --up"
         )
-    tilt = found.tilt_deg()
+    nearest = rotation_to_z(_nearest_axis(found.up)) if params.up == "auto" else np.eye(3)
+    tilt = np.degrees(np.arccos(np.clip(nearest[2] @ found.up, -1, 1)))
     if tilt < MIN_TILT_DEG or (not found.has_walls and tilt < MAX_SLOPE_DEG):
-        return coarse
+        if not np.array_equal(nearest, np.eye(3)):
+            warn(f"up is the map's {_axis_name(nearest[2])} axis")
+        return nearest @ coarse
     R = rotation_to_z(found.up) @ coarse
-    warn(_tilt_text(found, R, tilt))
+    warn(_tilt_text(found, R))
     return R
 
 
-def _tilt_text(found: Upright, R: F64, tilt: float) -> str:
+def _nearest_axis(up: F64) -> F64:
+    """(3,) signed coordinate axis that is nearest to a direction."""
+    axis = np.zeros(3)
+    largest = np.abs(up).argmax()
+    axis[largest] = np.sign(up[largest])
+    return axis
+
+
+def _axis_name(up: F64) -> str:
+    largest = int(np.abs(up).argmax())
+    return f"{'-' if up[largest] < 0 else ''}{'xyz'[largest]}"
+
+
+def _tilt_text(found: Upright, R: F64) -> str:
     up = R[2]  # the world's z axis in the map's axes
-    axis = "xyz"[int(np.abs(up).argmax())]
-    sign = "-" if up[np.abs(up).argmax()] < 0 else ""
-    rest = np.degrees(np.arccos(np.clip(np.abs(up).max(), -1, 1)))
+    tilt = np.degrees(np.arccos(np.clip(np.abs(up).max(), -1, 1)))
     by = "walls" if found.has_walls else "ground"
-    return f"up is the map's {sign}{axis} axis, tilted by {rest:.1f} degrees (from its {by}): levelled"
+    return f"up is the map's {_axis_name(up)} axis, tilted by {tilt:.1f} degrees (from its {by}): levelled"
 
 
 def _add_trajectory(source: Path, out: Path, T_world_map: F64, unit: float) -> None:

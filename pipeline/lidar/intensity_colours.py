@@ -3,7 +3,7 @@
 Intensity falls with range and angle of incidence, and differs between lidars, so only its contrast to the
 surroundings is kept. Where the path of the sensor is known, the effect of range and angle is divided out first
 (`pipeline.lidar.intensity`). On the ground, what reflects far more than its surroundings (lane markings, crossings)
-becomes white.
+becomes white. At the foot of walls and furniture the floor has one shade: noise makes their lowest points part of it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from scan2sim.pipeline.core.classes import CODE, GROUPS, colour_of, group_of
-from scan2sim.pipeline.core.types import F32, U8, PointCloud, Trajectory
+from scan2sim.pipeline.core.types import F32, I64, U8, Bools, PointCloud, Trajectory
 from scan2sim.pipeline.lidar import intensity
 
 LEVEL_CELL_M = 0.5
@@ -27,6 +27,8 @@ SHADES, GROUND_SHADES = (0.55, 1.25), (0.8, 1.15)
 MARKING_SIGMAS = (1.8, 3.6)
 """Contrast on the ground, in robust standard deviations, from which points turn white, and are white."""
 MARKING_RGB = (235, 235, 230)
+FOOT_M = 0.2
+"""Distance from what stands on a floor within which the floor's points may be its own."""
 GROUND_RGB = (112, 112, 114)
 """Tint of the ground: asphalt; shape alone doesn't distinguish it from soil."""
 
@@ -54,6 +56,8 @@ def intensity_colours(cloud: PointCloud, path: Trajectory | None = None, tint: U
         if len(rows) < intensity.MIN_POINTS:
             continue  # keep the plain tint
         contrast = _contrast(replace(cloud, rgb=None).take(rows), strength[rows], path)
+        if is_ground[one]:
+            contrast[_at_foot(cloud.xyz, code, rows)] = 0
         low, high = np.percentile(contrast, (DARK_PERCENTILE, BRIGHT_PERCENTILE)).tolist()
         share = np.clip((contrast - low) / max(high - low, 1e-6), 0, 1)
         dark, bright = GROUND_SHADES if is_ground[one] else SHADES
@@ -98,3 +102,15 @@ def _marking(contrast: F32) -> F32:
     """(N,) share of white: 1 where the ground reflects far more than its surroundings."""
     begin, end = MARKING_SIGMAS
     return np.clip((contrast - begin) / (end - begin), 0, 1).astype(np.float32)
+
+
+def _at_foot(xyz: F32, code: U8, rows: I64) -> Bools:
+    """(K,) which ground points `rows` (K,) are on the floor of a room, within `FOOT_M` of what stands on it."""
+    from scipy.spatial import cKDTree
+
+    at_foot = code[rows] == CODE["floor"]
+    standing = xyz[group_of()[code] != GROUPS.index("terrain")]
+    if at_foot.any() and len(standing):
+        near = cKDTree(standing).query(xyz[rows[at_foot]], distance_upper_bound=FOOT_M, workers=-1)[0]
+        at_foot[at_foot] = np.isfinite(near)
+    return at_foot

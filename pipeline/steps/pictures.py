@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.core.classes import SURFACES, colour_of
+from scan2sim.pipeline.core.classes import CODE, SURFACES, colour_of
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, U8, Camera, Mesh, PointCloud, Trajectory
 from scan2sim.pipeline.io import sky
@@ -20,7 +20,7 @@ from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.images.album import Album
 
 if TYPE_CHECKING:
-    from scan2sim.pipeline.camera.renderer import Image
+    from scan2sim.pipeline.camera.renderer import Image, Renderer
 
 GROUP_RGB = {
     "terrain": (176, 158, 138),
@@ -52,8 +52,8 @@ class PicturesParams(Params):
 def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) -> Done:
     """Render the tile: classes, meshes, triangles, texture pages, the textured world, and comparisons with photos.
 
-    Held-out photos are compared first. The textured world is shown from above and from the scanner's viewpoint: that of
-    a driver if there is a path, else an aerial view of the whole tile.
+    Held-out photos are compared first. The textured world is shown from above, without the ceilings of rooms, and from
+    the scanner's viewpoint: that of a driver if there is a path, else an aerial view of the whole tile.
     """
     from scan2sim.pipeline.camera import renderer as render
 
@@ -65,23 +65,29 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     groups = [g for g in SURFACES if g in inputs]
     plain = render.Renderer([render.Body(Mesh.load(inputs[f"decimate.{g}"]), colour=GROUP_RGB[g]) for g in groups])
     world = render.Renderer([render.textured(inputs[g]) for g in groups], sky.read(inputs.get("sky")))
+    open_plain, open_world = without_ceilings(groups, plain), without_ceilings(groups, world)
     low, high = bounds([body.mesh.vertices for body in world.bodies if len(body.mesh)] or [cloud.xyz])
     camera = render.pinhole(params.width, params.width * 9 // 16, field=75)
     shown = np.concatenate([body.mesh.vertices for body in world.bodies if len(body.mesh)] or [cloud.xyz])
-    eye, where = whole_pose(shown.clip(low, high), camera), "From the air"
+    eye, where, what = whole_pose(shown.clip(low, high), camera), "From the air", "The whole world."
+    first_plain, first_world = open_plain, open_world
     if path is not None and len(path) > 1:
         eye, where = driver_pose(path.positions, low, high, plain), "From a driver's eye"
+        what = "The textured world as a robot's camera sees it."
+        first_plain, first_world = plain, world
 
     def above(renderer: render.Renderer, **how: Any) -> U8:
         return landscape(renderer.above(low, high, width=params.width, **how).rgb)
 
     report(0.1, where)
-    first = world.view(camera, eye)
+    first = first_world.view(camera, eye)
     album.add("hero", first.rgb, "hero", where, "")
-    album.add("eye", first.rgb, "world", f"{where}.", "The textured world as a robot's camera sees it.")
-    album.add("above", above(world), "world", "From above.", f"{high[0] - low[0]:.0f} m by {high[1] - low[1]:.0f} m.")
+    album.add("eye", first.rgb, "world", f"{where}.", what)
+    album.add(
+        "above", above(open_world), "world", "From above.", f"{high[0] - low[0]:.0f} m by {high[1] - low[1]:.0f} m."
+    )
     report(0.3, "aerial view")
-    album.add("bird", world.view(camera, bird_pose(low, high)).rgb, "world", "From a bird's eye.", "")
+    album.add("bird", open_world.view(camera, bird_pose(low, high)).rgb, "world", "From a bird's eye.", "")
     album.add(
         "seen",
         seen_colours(first),
@@ -94,22 +100,22 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     assert cloud.classification is not None
     album.add(
         "classes",
-        points_from_above(cloud, low, high, params.width),
+        points_from_above(cloud.take(cloud.classification != CODE["ceiling"]), low, high, params.width),
         "step",
         "Classes.",
         "The thinned points by class.",
     )
     album.add(
         "mesh",
-        plain.view(camera, eye, shaded=True).rgb,
+        first_plain.view(camera, eye, shaded=True).rgb,
         "step",
         "Mesh.",
         "After Poisson, trimming and decimation, by class.",
     )
-    lines = plain.view(camera, eye, shaded=True, wireframe=True)
+    lines = first_plain.view(camera, eye, shaded=True, wireframe=True)
     total = sum(len(body.mesh) for body in plain.bodies)
     album.add("wireframe", lines.rgb, "step", "Triangles.", f"{total:,} of them, each class to its own target.")
-    album.add("mesh_above", above(plain, shaded=True), "step", "Mesh from above.", "")
+    album.add("mesh_above", above(open_plain, shaded=True), "step", "Mesh from above.", "")
 
     report(0.6, "pages")
     for group, body in zip(groups, world.bodies, strict=True):
@@ -140,6 +146,14 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
         )
     album.save()
     return Done({"pictures": folder}, {"pictures": len(album.index)})
+
+
+def without_ceilings(groups: Sequence[str], renderer: Renderer) -> Renderer:
+    """Renderer of the bodies (one for each of `groups`) but the ceilings of rooms, which hide the rooms from above."""
+    from scan2sim.pipeline.camera.renderer import Renderer
+
+    bodies = [body for group, body in zip(groups, renderer.bodies, strict=True) if group != "ceiling"]
+    return renderer if len(bodies) == len(groups) else Renderer(bodies, renderer.sky)
 
 
 def bounds(parts: list[Any]) -> tuple[F64, F64]:
@@ -266,4 +280,4 @@ def _compared(held: Sequence[bool], coverage: Sequence[float], count: int) -> li
     return sorted(range(len(held)), key=lambda i: (not held[i], -coverage[i]))[:count]
 
 
-PICTURES = Step("pictures", 5, pictures, PicturesParams, memory=(1.3, 3))
+PICTURES = Step("pictures", 6, pictures, PicturesParams, memory=(1.3, 3))

@@ -224,7 +224,7 @@ def test_vegetation_as_locations_with_low_poly_plants(street: Path, world: Path,
     changed = [f"--set={name}" for name in ("split.vegetation=locations", "backdrop.when=never", "roads.when=never")]
     with inline_steps():
         stdout_of(in_process("run", street, "--out", out, "--hold-out", 2, *SMALL, *changed))
-    pages = list((out / "world").rglob("vegetation*.png"))
+    pages = list((out / "world").rglob("*_vegetation_*.png"))
     assert len(pages) == 1  # texture of the low-poly plants
     features = json.loads(next((out / "world").rglob("plants.geojson")).read_text(encoding="utf-8"))["features"]
     assert features and all(f["properties"]["height_m"] > 0 for f in features)

@@ -39,6 +39,19 @@ def test_missing_world_has_no_commands(tmp_path: Path, monkeypatch: pytest.Monke
     assert gazebo.lines(tmp_path / "street.sdf") == [f"World:  {tmp_path}", shown]
 
 
+@pytest.mark.parametrize(("target", "command"), [("gz", "gz sim"), ("ign-tools", "ign gazebo")])
+def test_printed_command_is_that_of_the_installed_release(
+    target: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Garden and later install `ign` as a link to `gz`; Fortress has a program of its own."""
+    (tmp_path / target).touch()
+    (tmp_path / "ign").symlink_to(tmp_path / target)
+    monkeypatch.setattr(shutil, "which", lambda name: str(tmp_path / name))
+    (tmp_path / "street.sdf").write_text("<sdf/>", encoding="utf-8")
+    (line,) = (line for line in gazebo.lines(tmp_path / "street.sdf") if line.startswith("Gazebo:"))
+    assert f" {command} " in line
+
+
 def test_command_of_an_inactive_environment_has_its_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))

@@ -92,6 +92,28 @@ def test_viewer_walks_through_a_world_without_photos(tmp_path: Path) -> None:
         assert page.value("document.getElementById('photos').hidden")
 
 
+def test_ceilings_are_seen_from_inside_only(tmp_path: Path) -> None:
+    synthetic.world(tmp_path)
+    run(tmp_path / "export" / "world", "--out", tmp_path / "page")
+    copy_of_the_ground = """(() => {
+        const ceiling = [...world.tiles.values()][0].find((mesh) => mesh.name.startsWith("terrain")).clone();
+        ceiling.name = "ceiling";
+        ceiling.position.z += 3;
+        world.put("ceiling", [ceiling], false);
+        return true;
+    })()"""
+    with chromium(tmp_path) as page:
+        page.open(tmp_path / "page" / "index.html")
+        page.until(f"window.world && {ALL_TILES_LOADED}")
+        above = canvas_pixels(page)
+        page.click("[data-to=walk]")
+        inside = canvas_pixels(page)
+        page.value(copy_of_the_ground)
+        assert np.abs(canvas_pixels(page) - inside).mean() > 3
+        page.click("[data-to=turn]")
+        assert (canvas_pixels(page) == above).all() and page.errors == []
+
+
 def test_missing_tile_script_is_reported(tmp_path: Path) -> None:
     synthetic.scene(tmp_path)
     run(tmp_path / "world", "--out", tmp_path / "page")

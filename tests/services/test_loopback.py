@@ -127,7 +127,7 @@ import psutil
 from scan2sim.flows.engine import workers
 
 if __name__ == "__main__":
-    with workers._dask(1, None):
+    with workers._dask(1, None, print):
         own = psutil.Process()
         for process in (own, *own.children(recursive=True)):
             print(*(one.laddr.ip for one in process.net_connections("tcp") if one.status == psutil.CONN_LISTEN))

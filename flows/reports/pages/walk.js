@@ -9,6 +9,7 @@
   const MAX_STEP_HEIGHT = 0.6; // metres above the feet: higher surfaces are not walked onto
   const WALK_SPEED = 3.5; // metres per second; four times as fast with Shift
   const SKY_COLOUR = 0xc8d6e6;
+  const CEILINGS = 1; // layer of the ceilings of rooms, which would hide the rooms from above
   const MOVES = {
     KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1],
     KeyA: [-1, 0], ArrowLeft: [-1, 0], KeyD: [1, 0], ArrowRight: [1, 0],
@@ -139,6 +140,7 @@
 
     // Add the meshes of a tile to the scene, and to the ground if they are `solid`.
     put(name, found, solid = true) {
+      for (const mesh of found) if (mesh.name.startsWith("ceiling")) mesh.layers.set(CEILINGS);
       this.scene.add(...found);
       this.tiles.set(name, found);
       if (solid) this.grounds.set(name, new Ground(found));
@@ -165,6 +167,7 @@
       this.walking = name === "walk";
       this.box.dataset.mode = name;
       this.orbit.enabled = !this.walking;
+      this.camera.layers[this.walking ? "enable" : "disable"](CEILINGS);
       const [eye, target] = this.about[name].map((place) => new THREE.Vector3(...place));
       this.camera.position.copy(eye);
       this.camera.lookAt(target);

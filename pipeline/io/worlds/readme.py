@@ -30,13 +30,18 @@ OPENING = {
 
 def write(folder: Path, scene: Scene, formats: Sequence[str]) -> None:
     """Write the file into a world's folder; `formats` are those of the world."""
-    parts = [f"# {scene.name}\n\nA world made by scan2sim from lidar and photos, as: {', '.join(formats)}.\n"]
+    parts = [f"# {scene.name}\n\nA world made by scan2sim, as: {', '.join(formats)}.\n"]
     if "gazebo" in formats:
         world = f"{scene.name}.sdf"
         parts.append(
             f"In Gazebo, in this folder:\n\n    {sdf.open_command(world)}\n\n"
             f"(Fortress, from 6.16: `{sdf.open_command(world, fortress=True)}`; Gazebo Classic doesn't read it)\n"
         )
+        if scene.robot_map is not None:
+            parts.append(
+                "With ROS 2, in this folder, Gazebo with a robot, the bridge and Nav2's map server:\n\n"
+                f"    ros2 launch {scene.name}.launch.py\n"
+            )
     if others := [f"- {OPENING[name].format(name=scene.name)}\n" for name in formats if name in OPENING]:
         parts.append("In other programs, in this folder:\n\n" + "".join(others))
     parts += _placing(scene, formats)

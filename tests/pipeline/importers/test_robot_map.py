@@ -13,7 +13,7 @@ from scan2sim.flows.commands.inspect_map import map_facts
 from scan2sim.pipeline.core.types import F32, F64, Frame, PointCloud
 from scan2sim.pipeline.geometry.surface_distance import sample_surface
 from scan2sim.pipeline.geometry.upright import find_up, rotation_to_z
-from scan2sim.pipeline.importers.robot_map import MapParams, import_map, map_files
+from scan2sim.pipeline.importers.robot_map import AXES, MapParams, import_map, map_files
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
@@ -120,6 +120,17 @@ def test_tilted_map_becomes_level_and_its_transform_maps_it_to_the_world(tmp_pat
 
     assert cKDTree(mapped).query(world)[0].max() < 0.005
     assert any("tilted by" in text for text in warnings)
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "x", "-z"])
+def test_level_map_with_another_up_axis_is_turned_by_right_angles_only(up: str, tmp_path: Path) -> None:
+    """As of a map whose z axis is up, a tilt that is smaller than the noise is kept."""
+    turn = rotation_to_z(np.array(AXES[up], np.float64))
+    xyz = (room() @ turn).astype(np.float32)
+    assert not np.array_equal(present(find_up(xyz)).up, AXES[up])
+    _, T, warnings = imported(save(tmp_path / "map.las", xyz), tmp_path / "tile")
+    assert np.array_equal(T[:3, :3], turn)
+    assert f"up is the map's {up} axis" in warnings
 
 
 def test_level_map_keeps_its_coordinates(tmp_path: Path) -> None:

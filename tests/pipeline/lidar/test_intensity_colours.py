@@ -43,6 +43,20 @@ def test_markings_are_lighter_than_the_road_at_all_ranges(spacing: float, known_
     assert np.mean((light > threshold)[marking & far]) > 0.8
 
 
+def test_lowest_points_of_bright_walls_are_no_markings_of_the_floor() -> None:
+    """Noise makes them points of the floor; markings elsewhere on it stay white."""
+    cloud, marking = road(0.1)
+    assert cloud.classification is not None and cloud.intensity is not None
+    cloud.classification[:] = CODE["floor"]
+    wall = np.abs(cloud.xyz[:, 1]) > 5.9
+    foot = (np.abs(cloud.xyz[:, 1]) > 5.75) & ~wall
+    cloud.classification[wall] = CODE["wall"]
+    cloud.intensity[wall | foot] *= 3
+    light = intensity_colours(cloud).mean(axis=1)
+    assert np.median(light[foot]) < 1.2 * np.median(light[~(wall | foot | marking)])
+    assert np.mean(light[marking] > 200) > 0.8
+
+
 def test_shades_are_independent_of_the_unit_of_the_intensity() -> None:
     low, high = (intensity_colours(road(0.2, scale=scale)[0]).mean(axis=1) for scale in (800, 60_000))
     assert np.median(np.abs(low - high)) < 8
