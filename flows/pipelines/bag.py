@@ -32,7 +32,9 @@ class BagSource(PoseSourceParams, PhotoPlacementParams, SelectionParams, BagPara
         "times if the points have them, else none.",
     )
     intrinsics: Path | None = Field(
-        None, description="TOML file with the cameras, as in a tile, instead of CameraInfo."
+        None,
+        description="File with the cameras instead of CameraInfo: TOML as in a tile, or the calibration of another "
+        "program (docs/inputs.md).",
     )
     urdf: Path | None = Field(
         None, description="URDF file of the robot: its fixed joints are added to the static transforms of the bag."

@@ -13,6 +13,7 @@ from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import Shift
 from scan2sim.pipeline.core.step import Params, Step
 from scan2sim.pipeline.io import gps as gps_io
+from scan2sim.pipeline.io.camera_calibrations import SUFFIXES as CALIBRATION_SUFFIXES
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS, SweepsParams
 from scan2sim.slam.steps.fuse import FUSE, FuseParams
@@ -40,7 +41,8 @@ class Sweeps(PoseSourceParams, SweepsParams):
     )
     extrinsics: Path | None = Field(
         None,
-        description="File of the matrix T_camera_scanner (3 or 4 rows, or KITTI's), if the poses are the camera's.",
+        description="File of T_camera_scanner, if the poses are the camera's or there are photos: a matrix of 3 or 4 "
+        "rows, KITTI's, or the calibration of another program (docs/inputs.md).",
     )
     times: Path | None = Field(
         None,
@@ -54,8 +56,9 @@ class Sweeps(PoseSourceParams, SweepsParams):
 
     @property
     def camera_file(self) -> Path | None:
-        """TOML file of the photos' camera, if `camera` names a file and not a camera model."""
-        return Path(self.camera) if self.camera.endswith(".toml") or Path(self.camera).is_file() else None
+        """File of the photos' camera, if `camera` names a file and not a camera model."""
+        path = Path(self.camera)
+        return path if path.suffix.lower() in (".toml", *CALIBRATION_SUFFIXES) or path.is_file() else None
 
     def inputs(self, here: Path) -> dict[str, Path]:
         """Input files of the import; paths are relative to `here`."""

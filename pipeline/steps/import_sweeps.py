@@ -21,7 +21,9 @@ class SweepsParams(sweeps.PlacementParams):
     """How sweeps are registered, and photos are added."""
 
     camera: str = Field(
-        "auto", description="Camera model of the photos: auto, pinhole, equirectangular, or a TOML file as in a tile."
+        "auto",
+        description="Camera model of the photos: auto, pinhole, equirectangular, or a file: TOML as in a tile, or the "
+        "calibration of another program (docs/inputs.md).",
     )
     focal: Focal | None = Field(None, description="Focal length of a pinhole camera in pixels.")
     centre: tuple[Pixels, Pixels] | None = Field(
