@@ -323,6 +323,13 @@ def test_inverted_extrinsics_are_detected(drive: Drive, tmp_path: Path) -> None:
     assert not notes and np.allclose(cloud_of(right)[2], expected, atol=2e-3)
 
 
+def test_poses_of_the_scanner_that_are_taken_for_the_cameras_are_detected(drive: Drive, tmp_path: Path) -> None:
+    notes: list[str] = []
+    scanner = drive.arguments | {"poses": drive.folder / "scanner.kitti"}
+    imported(**scanner, out=tmp_path / "tile", warn=notes.append)
+    assert any("look like the scanner's: with `--scanner-poses`" in text for text in notes)
+
+
 def test_kitti_camera_2_is_offset_from_camera_0(drive: Drive, tmp_path: Path) -> None:
     """`Tr` is of camera 0; P2 gives camera 2 an offset of 6 cm."""
     K, offset = np.array([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), np.array([0.0613, -0.001, 0.003])
