@@ -12,8 +12,8 @@ from scan2sim.flows.pipelines.graph import Output, Task, TaskId, folder_inputs
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import Shift
 from scan2sim.pipeline.core.step import Params, Step
+from scan2sim.pipeline.io import camera_calibrations
 from scan2sim.pipeline.io import gps as gps_io
-from scan2sim.pipeline.io.camera_calibrations import SUFFIXES as CALIBRATION_SUFFIXES
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS, SweepsParams
 from scan2sim.slam.steps.fuse import FUSE, FuseParams
@@ -57,8 +57,7 @@ class Sweeps(PoseSourceParams, SweepsParams):
     @property
     def camera_file(self) -> Path | None:
         """File of the photos' camera, if `camera` names a file and not a camera model."""
-        path = Path(self.camera)
-        return path if path.suffix.lower() in (".toml", *CALIBRATION_SUFFIXES) or path.is_file() else None
+        return camera_calibrations.file_of(self.camera)
 
     def inputs(self, here: Path) -> dict[str, Path]:
         """Input files of the import; paths are relative to `here`."""

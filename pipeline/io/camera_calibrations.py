@@ -72,6 +72,12 @@ class CalibratedCamera:
     rectified: Camera | None = None
 
 
+def file_of(camera: str) -> Path | None:
+    """The file that the option of a camera names, if it isn't a camera model."""
+    path = Path(camera)
+    return path if path.suffix.lower() in (".toml", *SUFFIXES) or path.is_file() else None
+
+
 def read_cameras(path: Path, size: tuple[int, int]) -> list[CalibratedCamera]:
     """Cameras of a calibration file.
 
