@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -204,6 +205,24 @@ def test_points_are_coloured_by_photos_and_photos_are_posed(drive: Drive, tmp_pa
     view, pose = tile.views[2], drive.camera.poses[2]
     assert np.allclose(tile.frame.to_crs(view.centre), pose[:3, 3], atol=1e-5)
     assert np.allclose(view.T_world_cam[:3, :3], pose[:3, :3], atol=1e-6) and view.time == pytest.approx(0.3)
+
+
+def test_photos_are_posed_by_the_calibration_of_another_program(drive: Drive, tmp_path: Path) -> None:
+    """Camera and T_lidar_camera of direct_visual_lidar_calibration, with poses of the scanner."""
+    T = np.linalg.inv(T_CAMERA_SCANNER)
+    pose = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+    lens = {"camera_model": "equirectangular", "intrinsics": [512, 256], "distortion_coeffs": []}
+    calib = tmp_path / "calib.json"
+    calib.write_text(json.dumps({"camera": lens, "results": {"T_lidar_camera": pose}}), encoding="utf-8")
+    words = ["import", "sweeps", drive.folder / "sweeps", drive.folder / "scanner.kitti", "--out", tmp_path / "tile"]
+    words += ["--photos", drive.folder / "photos", "--camera", calib, "--extrinsics", calib, "--scanner-poses"]
+    result = CliRunner().invoke(app, [*map(str, words), "--pose-source", "given"])
+    assert result.exit_code == 0, result.output
+    tile, cloud, xyz = cloud_of(tmp_path / "tile")
+    right = (present(cloud.rgb) == PAINT[walls(xyz)[1]]).all(axis=1)
+    assert right[np.sort(np.abs(np.concatenate([xyz - LOW, xyz - HIGH], axis=1)), axis=1)[:, 1] > 0.5].mean() > 0.99
+    assert np.allclose(tile.views[2].T_world_cam[:3, :3], drive.camera.poses[2, :3, :3], atol=1e-6)
+    assert np.allclose(tile.frame.to_crs(tile.views[2].centre), drive.camera.positions[2], atol=1e-5)
 
 
 def test_mask_is_imported_and_masked_pixels_give_no_colour(drive: Drive, tmp_path: Path) -> None:
