@@ -23,6 +23,8 @@ CAMERAS_REMEDY = (
     "Write [[cameras]] with id, model, size, focal, centre as in a tile.toml (docs/reference/formats.md), or give the "
     "file of Kalibr, ROS, OpenCV or direct_visual_lidar_calibration (.yaml, .json, .xml)"
 )
+MAX_LEVER_ARM_M = 20.0
+"""Largest distance of a camera from the scanner of a vehicle; calibrations in millimetres exceed it."""
 MAX_VALUE = 1e8
 """Plausibility limit of calibration values."""
 
@@ -64,11 +66,15 @@ def _rigid(path: Path, rows: F64, remedy: str) -> F64:
     """A rigid transform (4, 4) of rows (3 or 4, 4), with an exact rotation.
 
     Raises:
-        InputError: it isn't rigid.
+        InputError: it isn't rigid, or the translation can't be in metres.
     """
     R = rows[:3, :3]
     if not np.isfinite(rows).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError(path, "its left 3x3 is not a rotation matrix", remedy)
+    distance = float(np.linalg.norm(rows[:3, 3]))
+    if distance > MAX_LEVER_ARM_M:
+        cause = f"puts the camera {distance:,.0f} m from the scanner"
+        raise InputError(path, cause, "Give the translation in metres (it may be in millimetres)")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = nearest_rotation(R), rows[:3, 3]
     return T
