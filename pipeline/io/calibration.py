@@ -17,7 +17,7 @@ from scan2sim.pipeline.io import camera_calibrations, file_checks, toml
 from scan2sim.pipeline.io.camera_calibrations import CalibratedCamera
 from scan2sim.pipeline.io.images.image import SUFFIXES, read_levels, size_of
 from scan2sim.pipeline.io.sweep_files import list_files
-from scan2sim.pipeline.io.tile import CameraEntry, camera_of
+from scan2sim.pipeline.io.tile import CameraEntry, camera_entry, camera_of
 
 CAMERAS_REMEDY = (
     "Write [[cameras]] with id, model, size, focal, centre as in a tile.toml (docs/reference/formats.md), or give the "
@@ -108,7 +108,7 @@ def photo_extrinsics(path: Path, photos: Path) -> F64 | None:
     return T
 
 
-def read_camera(path: Path, width: int, height: int, *, names: Iterable[str] = (), rectified: bool = False) -> Camera:
+def read_camera(path: Path, width: int, height: int, *, names: Sequence[str] = (), rectified: bool = False) -> Camera:
     """The camera for photos of a size, from `[[cameras]]` of a TOML file or tile, or another program's calibration.
 
     Args:
@@ -130,14 +130,14 @@ def read_camera(path: Path, width: int, height: int, *, names: Iterable[str] = (
         cause = f"has several cameras of {width}x{height} ({', '.join(one.names[0] for one in named)})"
         wanted = f"Give the right one the id {' or '.join(filter(None, names))}" if any(names) else "Remove the others"
         raise InputError(path, cause, f"{wanted}, or give a file with one camera")
-    if not rectified:
-        return named[0].camera
-    if named[0].rectified is None:
+    raw = named[0].camera
+    chosen = (named[0].rectified or (None if raw.distortion else raw)) if rectified else raw
+    if chosen is None:
         raise InputError(
             path, "has the camera of raw images, but those of the bag are rectified",
             "Choose the topic of the raw images with --camera, or write the pinhole camera of P as [[cameras]]",
         )  # fmt: skip
-    return named[0].rectified
+    return camera_of(path, CameraEntry.model_validate(camera_entry(named[0].names[0], chosen)))  # checks its numbers
 
 
 def _no_camera_of_size(path: Path, found: Sequence[CalibratedCamera], width: int, height: int) -> InputError:

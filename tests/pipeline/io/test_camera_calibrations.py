@@ -217,6 +217,7 @@ def test_autoware_has_the_camera_in_the_lidar_and_fast_livo_the_lidar_in_the_cam
         ({k: v for k, v in ros().items() if "coefficients" not in k}, "but no distortion coefficients"),
         (ros(camera_matrix=matrix(3, K * np.nan)), "`cameramatrix` contains NaN"),
         (ros(image_width=0), "is not calibrated"),
+        (ros(camera_matrix=matrix(3, K * [[1e9, 1, 1]] * [[1], [1], [1]])), "exceeds 1,000,000"),
         ({"model_kind": "PINHOLE", "projection_parameters": {}}, r"is not a calibration.*its keys: model_kind"),
         (vins("MEI", {}), r"has the model 'mei' \(Mei"),
         (vins("PINHOLE", {"k1": 0.1}), "`k2` is missing"),
@@ -269,6 +270,8 @@ def test_several_cameras_of_one_size_are_told_apart_by_name(tmp_path: Path) -> N
 def test_rectified_photos_have_the_camera_of_the_projection_matrix(tmp_path: Path) -> None:
     camera = read_camera(save(tmp_path / "front.yaml", ros()), *SIZE, rectified=True)
     assert camera == Camera("pinhole", *SIZE, 350, 350, 330, 250)
+    plain = save(tmp_path / "plain.yaml", {"cam0": kalibr("none", [])})
+    assert read_camera(plain, *SIZE, rectified=True) == read_camera(plain, *SIZE)
     with pytest.raises(InputError, match="has the camera of raw images"):
         read_camera(save(tmp_path / "camchain.yaml", {"cam0": kalibr()}), *SIZE, rectified=True)
 
