@@ -91,7 +91,9 @@ class BagParams(Params):
         "header", description="Times of messages: header (of the sensors), or log (when they were recorded)."
     )
     transform: tuple[str, ...] = Field(
-        (), description="Static transform missing in the bag: 'PARENT CHILD x y z qx qy qz qw'; repeatable."
+        (),
+        description="Static transform missing in the bag, or instead of its own: 'PARENT CHILD x y z qx qy qz qw'; "
+        "repeatable.",
     )
     photo_interval: Seconds | None = Field(
         None, description="Least time between two photos of a camera in seconds; default: all photos."
@@ -191,7 +193,7 @@ class _Planner:
 
     def plan(self) -> Plan:
         self._add_urdf()
-        self.found.frames.add_given(self.params.transform)
+        self.warnings += self.found.frames.add_given(self.params.transform)
         lidars = self.lidars()
         scanner = lidars[0].frame
         poses = self.poses(scanner)
