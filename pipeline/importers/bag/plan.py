@@ -65,7 +65,7 @@ class BagParams(Params):
         gps: topic of a NavSatFix that is fused with lidar odometry and georeferences the world; or "none".
         world_frame: frame of the world in /tf; default: map, world or odom, else the root.
         stamps: times of messages: of their headers, or at which they were recorded.
-        transform: further static transforms, "PARENT CHILD x y z qx qy qz qw".
+        transform: static transforms, "PARENT CHILD x y z qx qy qz qw"; they replace the bag's.
         photo_interval: least time between two photos of a camera, seconds; default: all photos.
     """
 
