@@ -46,7 +46,7 @@ def camera_of(info: Any, *, rectified: bool) -> Camera:
     cx, cy = cx - roi.x_offset, cy - roi.y_offset
     width, height = int(roi.width) or width, int(roi.height) or height
     fx, fy, cx, cy = fx / bin_x, fy / bin_y, (cx + 0.5) / bin_x - 0.5, (cy + 0.5) / bin_y - 0.5
-    model, distortion = ("pinhole", ()) if rectified else distortion_of(str(info.distortion_model), D)
+    model, distortion = distortion_of("", np.zeros(0)) if rectified else distortion_of(str(info.distortion_model), D)
     return Camera(model, width // bin_x, height // bin_y, float(fx), float(fy), float(cx), float(cy), distortion)
 
 
