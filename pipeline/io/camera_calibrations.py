@@ -16,15 +16,24 @@ centre of the top left one, and their axes are x right, y down, z ahead, so only
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from scan2sim.pipeline.camera.distortion_fit import (
+    MAX_FIT_ERROR_PX,
+    double_sphere_radius,
+    extended_unified_radius,
+    field_of_view_radius,
+    fit_fisheye,
+    max_distorted_radius,
+)
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io import file_checks, xml
@@ -49,6 +58,8 @@ LIVO_MODELS = {
     "equidistantcamera": ("equidistant", ("k1", "k2", "k3", "k4")),
 }
 """Camera models of FAST-LIVO in lower case: distortion model, and keys of its coefficients (0 if missing)."""
+SYMMETRIC_MODELS = {"ds": double_sphere_radius, "eucm": extended_unified_radius}
+"""Models of Kalibr with two parameters before the focal lengths."""
 CAMODOCAL_MODELS = {
     "PINHOLE": ("plumb_bob", "distortion_parameters", ("k1", "k2", "p1", "p2"), ("fx", "fy", "cx", "cy")),
     "KANNALA_BRANDT": ("fisheye", "projection_parameters", ("k2", "k3", "k4", "k5"), ("mu", "mv", "u0", "v0")),
@@ -131,14 +142,47 @@ def read_extrinsics(path: Path) -> F64:
 def _kalibr(tree: Tree, size: tuple[int, int]) -> Iterator[CalibratedCamera]:
     for name, entry in _kalibr_entries(tree):
         with _about(name):
-            check_model(model := str(entry["camera_model"]))
-            if model != "pinhole":
-                raise InvalidCamera(f"has the unknown camera_model {model!r}")
-            width, height = _numbers(entry, "resolution", 2).astype(int).tolist()
-            lens, distortion = distortion_of(str(entry["distortion_model"]), _numbers(entry, "distortion_coeffs"))
-            fx, fy, cx, cy = _numbers(entry, "intrinsics", 4).tolist()
-            camera = _checked(Camera(lens, width, height, fx, fy, cx, cy, distortion))
+            camera = _checked(_kalibr_camera(entry))
         yield CalibratedCamera((name, str(entry.get("rostopic", name))), camera)
+
+
+def _kalibr_camera(entry: Tree) -> Camera:
+    model, distortion = str(entry["camera_model"]), str(entry["distortion_model"])
+    width, height = _numbers(entry, "resolution", 2).astype(int).tolist()
+    D = _numbers(entry, "distortion_coeffs")
+    if model in SYMMETRIC_MODELS and not D.any():
+        first, second, *intrinsics = _numbers(entry, "intrinsics", 6).tolist()
+        radius = partial(SYMMETRIC_MODELS[model], first, second)
+        return _symmetric(Camera("fisheye", width, height, *intrinsics), model, radius)
+    check_model(model)
+    if model != "pinhole":
+        raise InvalidCamera(f"has the unknown camera_model {model!r}")
+    intrinsics = _numbers(entry, "intrinsics", 4).tolist()
+    if distortion == "fov" and len(D) == 1:
+        radius = partial(field_of_view_radius, float(D[0]))
+        return _symmetric(Camera("fisheye", width, height, *intrinsics), distortion, radius)
+    lens, coefficients = distortion_of(distortion, D)
+    return Camera(lens, width, height, *intrinsics, coefficients)
+
+
+def _symmetric(camera: Camera, model: str, radius: Callable[[F64], F64]) -> Camera:
+    """The fisheye camera of a lens that is symmetric about its axis.
+
+    Args:
+        camera: size, focal lengths and principal point of the lens.
+        model: its name.
+        radius: function of angles to the axis (`fit_fisheye`).
+
+    Raises:
+        InvalidCamera: a fisheye camera deviates from it.
+    """
+    _checked(camera)
+    edge = max_distorted_radius(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    with np.errstate(all="ignore"):
+        slope, k, error = fit_fisheye(radius, edge, max(camera.fx, camera.fy))
+    if not (error <= MAX_FIT_ERROR_PX and np.isfinite([slope, *k]).all()):
+        raise InvalidCamera(f"has the model {model!r}, from which a fisheye camera deviates by {error:.2f} pixels")
+    return replace(camera, fx=camera.fx * slope, fy=camera.fy * slope, distortion=tuple(k.tolist()))
 
 
 def _kalibr_entries(tree: Tree) -> list[tuple[str, Tree]]:

@@ -132,6 +132,44 @@ def test_cameras_project_as_in_the_program_that_calibrated_them(tmp_path: Path, 
     assert agrees(read_camera(tmp_path / "calibration.json", *SIZE), expected)
 
 
+def double_sphere(p: F64) -> F64:
+    """Pixels as Kalibr computes them, relative to the focal lengths and the centre."""
+    d, xi, alpha = np.linalg.norm(p, axis=1), -0.2, 0.59
+    k = xi * d + p[:, 2]
+    return p[:, :2] / (alpha * np.sqrt(p[:, 0] ** 2 + p[:, 1] ** 2 + k * k) + (1 - alpha) * k)[:, None]
+
+
+def extended_unified(p: F64) -> F64:
+    alpha, beta = 0.61, 1.05
+    d = np.sqrt(beta * (p[:, 0] ** 2 + p[:, 1] ** 2) + p[:, 2] ** 2)
+    return p[:, :2] / (alpha * d + (1 - alpha) * p[:, 2])[:, None]
+
+
+def field_of_view(p: F64) -> F64:
+    y, w = p[:, :2] / p[:, 2:], 0.92
+    r = np.linalg.norm(y, axis=1)[:, None]
+    return y * np.arctan(2 * np.tan(w / 2) * r) / (r * w)
+
+
+@pytest.mark.parametrize(
+    ("chain", "model", "widest_deg"),
+    [
+        (kalibr("none", [], camera_model="ds", intrinsics=[-0.2, 0.59, *F, *C]), double_sphere, 100),
+        (kalibr("none", [], camera_model="eucm", intrinsics=[0.61, 1.05, *F, *C]), extended_unified, 100),
+        (kalibr("fov", [0.92]), field_of_view, 75),
+    ],
+)
+def test_symmetric_lenses_become_fisheye_cameras_that_agree_to_a_twentieth_of_a_pixel(
+    tmp_path: Path, chain: dict[str, Any], model: Any, widest_deg: float
+) -> None:
+    angle, azimuth = np.random.default_rng(0).uniform([0.01, 0], [np.radians(widest_deg), 6.28], (2000, 2)).T
+    rays = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], axis=1)
+    expected = model(rays) * F + C
+    seen = ((expected > 0) & (expected < SIZE)).all(axis=1)
+    uv, valid = project_exactly(read_camera(save(tmp_path / "chain.yaml", {"cam0": chain}), *SIZE), rays)
+    assert seen.sum() > 500 and valid[seen].all() and np.abs(uv - expected)[seen].max() < 0.05
+
+
 @pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
 @pytest.mark.parametrize("wide", [False, True])
 def test_files_that_opencv_writes_are_read(tmp_path: Path, suffix: str, wide: bool) -> None:
@@ -203,7 +241,9 @@ def test_autoware_has_the_camera_in_the_lidar_and_fast_livo_the_lidar_in_the_cam
     [
         ({"cam0": kalibr(camera_model="omni")}, r"'cam0' has the model 'omni' \(Mei.*no counterpart.*pinhole-equi"),
         ({"cam0": kalibr(camera_model="ds")}, r"'ds' \(the double sphere model\)"),
-        ({"cam0": kalibr("fov", [0.9])}, r"'fov' \(the field of view model\)"),
+        ({"cam0": kalibr("fov", [0.9, 0.1])}, r"'fov' \(the field of view model\)"),
+        ({"cam0": kalibr("fov", [3.0])}, "'fov', from which a fisheye camera deviates by"),
+        ({"cam0": kalibr("none", [], camera_model="ds", intrinsics=[-3, 0.1, *F, *C])}, "'ds'.*deviates by inf"),
         ({"cam0": kalibr("radtan", BROWN[:3])}, "has 3 coefficients of the model 'radtan'"),
         ({"cam0": kalibr(intrinsics=[400, 320, 240])}, "`intrinsics` has 3 numbers, expected 4"),
         ({"cam0": kalibr(resolution=[1280, 960])}, r"640x480 \(it has 1280x960\).*focal = \[200\.750, 201\.625\]"),
