@@ -60,7 +60,7 @@ def fit_fisheye(radius: Callable[[F64], F64], max_radius: float, focal: float) -
     """
     theta = np.linspace(0, MAX_FISHEYE_ANGLE, 4000)[1:]
     r, slope = radius(theta), float(radius(np.full(1, 1e-5))[0]) / 1e-5
-    decreasing = np.flatnonzero(~(np.diff(r, prepend=0.0) > 0))
+    decreasing = np.flatnonzero(~(np.isfinite(r) & (np.diff(r, prepend=0.0) > 0)))
     end = int(decreasing[0]) if len(decreasing) else len(r)
     end = min(end, int(np.searchsorted(r[:end], max_radius)) + 1)
     if end < 2:
