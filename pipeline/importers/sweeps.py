@@ -253,6 +253,8 @@ def tilt_warning(path: Trajectory, T_camera_scanner: F64, placing: PlacementPara
     up = mean_up(path.poses @ mount)
     if up >= MIN_UP:
         return None
+    if not placing.scanner_poses and mean_up(path.poses) > MIN_UPRIGHT:
+        return "the poses look like the scanner's: with `--scanner-poses` its z axis points upwards"
     if not placing.scanner_poses and mean_up(path.poses @ np.linalg.inv(mount)) > MIN_UPRIGHT:
         option = "without" if placing.invert_extrinsics else "with"
         return f"extrinsics look inverted: {option} `--invert-extrinsics` the scanner's z axis points upwards"
