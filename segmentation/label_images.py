@@ -109,6 +109,6 @@ def _meaning(names: Path) -> tuple[U8, Bools]:
     if not names.is_file():
         table = index_of_code()
         return table, (table != IGNORED) | np.isin(np.arange(256), (UNCLASSIFIED, IGNORED))
-    given = map_labels(read_names(names), str(names))
+    given = map_labels(read_names(names), str(names), whole_scene=False)
     table = np.concatenate([given, np.full(256, IGNORED, np.uint8)])[:256]
     return table, (np.arange(256) < len(given)) | (np.arange(256) == IGNORED)

@@ -113,16 +113,18 @@ def read_names(path: Path) -> list[str]:
     return names
 
 
-def map_labels(names: Sequence[str], where: str) -> U8:
-    """(len(names),) index into `CLASSES` of every label of a network, `IGNORED` for labels without a class.
+def map_labels(names: Sequence[str], where: str, *, whole_scene: bool = True) -> U8:
+    """(len(names),) index into `CLASSES` of every label, `IGNORED` for labels without a class.
 
     Args:
-        names: names of the network's labels, in order; those that the best matching set of `LABEL_SETS` doesn't have
-            are looked up in the others. Of names with parents ("construction--flat--road") the last parts count.
+        names: names of the labels, in order; those that the best matching set of `LABEL_SETS` doesn't have are looked
+            up in the others. Of names with parents ("construction--flat--road") the last parts count.
         where: file with the labels, for the error message.
+        whole_scene: reject labels of objects alone, as of networks for instances.
 
     Raises:
-        InputError: the names are of fewer than four classes, or of no ground or no building.
+        InputError: no name is known, or the names are not of a whole scene: of fewer than four classes, or of no ground
+            or no building.
     """
     parts = [name.split("--") for name in names]
     plain = [[_plain("".join(part[i:])) for i in range(len(part))] for part in parts]
@@ -130,7 +132,8 @@ def map_labels(names: Sequence[str], where: str) -> U8:
     table = {label: ours for labels in LABEL_SETS.values() for label, ours in labels.items()} | best
     found = [next((table[one] for one in name if one in table), None) for name in plain]
     classes = {name for name in found if name}
-    if len(classes) < 4 or "building" not in classes or not classes & set(GROUND_CLASSES):
+    partial = len(classes) < 4 or "building" not in classes or not classes & set(GROUND_CLASSES)
+    if not classes or (whole_scene and partial):
         raise InputError(
             where,
             f"unknown label set ({', '.join(list(names)[:6])} ...)",

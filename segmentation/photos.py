@@ -137,7 +137,13 @@ class Classifier:
         if fixed is None:
             return self.tile, self.tile
         factor = min(self.tile / max(fixed), height / fixed[0], width / fixed[1])
-        return max(1, round(fixed[0] * factor)), max(1, round(fixed[1] * factor))
+
+        def side(length: int, own: int) -> int:
+            """A multiple of the stride, at which tiles begin, or the whole length: else its last pixels had no tile."""
+            n = round(own * factor)
+            return length if n >= length else max(1, n // OUTPUT_STRIDE) * OUTPUT_STRIDE
+
+        return side(height, fixed[0]), side(width, fixed[1])
 
     def _add_tile(self, part: U8, top: int, left: int, out: F32, weight: F32) -> None:
         """Add a tile's probabilities, with weights that fall towards its borders."""

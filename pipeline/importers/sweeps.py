@@ -31,7 +31,7 @@ from scan2sim.pipeline.io.sweep_files import SWEEP_SUFFIXES, Sweep, list_files, 
 from scan2sim.pipeline.io.trajectory import QUATERNIONS_HELP, QuaternionOrder
 from scan2sim.pipeline.pose_check.conventions import AXES, CameraAxes
 
-VERSION = 2
+VERSION = 3
 """Version of the importer: raised when the same input and options give another tile."""
 MAX_PHOTO_DISTANCE_M = 2.0
 """Distance between a sweep and the photo that colours it, so that their views of the scene hardly differ."""

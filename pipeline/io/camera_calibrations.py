@@ -157,12 +157,12 @@ def _kalibr_camera(entry: Tree) -> Camera:
     check_model(model)
     if model != "pinhole":
         raise InvalidCamera(f"has the unknown camera_model {model!r}")
-    intrinsics = _numbers(entry, "intrinsics", 4).tolist()
+    fx, fy, cx, cy = _numbers(entry, "intrinsics", 4).tolist()
     if distortion == "fov" and len(D) == 1:
         radius = partial(field_of_view_radius, float(D[0]))
-        return _symmetric(Camera("fisheye", width, height, *intrinsics), distortion, radius)
+        return _symmetric(Camera("fisheye", width, height, fx, fy, cx, cy), distortion, radius)
     lens, coefficients = distortion_of(distortion, D)
-    return Camera(lens, width, height, *intrinsics, coefficients)
+    return Camera(lens, width, height, fx, fy, cx, cy, coefficients)
 
 
 def _symmetric(camera: Camera, model: str, radius: Callable[[F64], F64]) -> Camera:
@@ -188,8 +188,8 @@ def _symmetric(camera: Camera, model: str, radius: Callable[[F64], F64]) -> Came
 def _kalibr_entries(tree: Tree) -> list[tuple[str, Tree]]:
     """Cameras of a chain of Kalibr by name."""
     keys = {"camera_model", "intrinsics", "distortion_model"}
-    entries = [(str(name), entry) for name, entry in tree.items() if isinstance(entry, dict) and keys <= entry.keys()]
-    return entries[:MAX_LENGTH]
+    tables: list[tuple[str, Tree]] = [(str(name), entry) for name, entry in tree.items() if isinstance(entry, dict)]
+    return [(name, entry) for name, entry in tables if keys <= entry.keys()][:MAX_LENGTH]
 
 
 def _direct_visual(tree: Tree, size: tuple[int, int]) -> Iterator[CalibratedCamera]:
@@ -401,7 +401,7 @@ def _numbers(tree: Tree, key: str, size: int | None = None) -> F64:
     Raises:
         InvalidCamera: there are none, another number than `size`, or not finite.
     """
-    value = tree.get(key)
+    value: Any = tree.get(key)
     value = value.get("data") if isinstance(value, dict) else value
     value = value.split() if isinstance(value, str) else value
     rows = value if isinstance(value, list) else [value]

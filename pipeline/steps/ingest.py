@@ -116,4 +116,4 @@ def _missing_attributes(parts: Sequence[PointCloud], names: Sequence[str]) -> li
     return found
 
 
-INGEST = Step("ingest", 3, ingest, IngestParams, memory=(0.4, 12))
+INGEST = Step("ingest", 4, ingest, IngestParams, memory=(0.4, 12))

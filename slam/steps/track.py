@@ -243,8 +243,9 @@ def _tile_camera(video: Video, params: TrackParams) -> Camera | None:
     if len(fitting) != 1:
         count, size = "several cameras" if fitting else "no camera", f"{video.width}x{video.height}"
         raise InputError(
-            video.path, f"the tile has {count} with an image size of {size}", "Give --camera (a file), or --focal"
-        )
+            video.path, f"the tile has {count} with an image size of {size}",
+            "Give a file by --camera, or leave out --tile and give --focal",
+        )  # fmt: skip
     return fitting[0]
 
 

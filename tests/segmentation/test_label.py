@@ -106,6 +106,13 @@ def test_label_images_replace_the_network(inputs: dict[str, Path], tmp_path: Pat
     assert done.metrics["classes"] == ("road", "building", "high_vegetation", "sky")
 
 
+def test_label_images_may_have_only_some_classes(inputs: dict[str, Path], tmp_path: Path) -> None:
+    done = by_images(inputs, labels(tmp_path / "masks", {"0": TRUTH, "1": TRUTH}, "void vehicle person void"))
+    assert best_of(done, 0) == ["", "vehicle", "person", ""] and not done.warnings
+    with pytest.raises(InputError, match="unknown label set"):
+        LabelImages(labels(tmp_path / "unknown", {"0": TRUTH}, "a b c d"), views_io.load(inputs["views"]))
+
+
 def test_label_images_without_names_are_las_codes(inputs: dict[str, Path], tmp_path: Path) -> None:
     done = by_images(inputs, labels(tmp_path / "masks", {"0": LAS_TRUTH}))
     assert best_of(done, 0) == ["road", "building", "high_vegetation", "sky"]
