@@ -47,6 +47,8 @@ def _class_by_label(**names: str) -> dict[str, str]:
     return {_plain(name): ours for ours, many in names.items() for name in many.split(",")}
 
 
+RECOGNIZED = 10
+"""Number of names of a label set from which a network's labels are that set."""
 LABEL_SETS: dict[str, dict[str, str]] = {
     "cityscapes": _class_by_label(
         road="road, parking, ground, bridge, tunnel", sidewalk="sidewalk", terrain="terrain, rail track, dynamic",
@@ -117,8 +119,8 @@ def map_labels(names: Sequence[str], where: str, *, whole_scene: bool = True) ->
     """(len(names),) index into `CLASSES` of every label, `IGNORED` for labels without a class.
 
     Args:
-        names: names of the labels, in order; those that the best matching set of `LABEL_SETS` doesn't have are looked
-            up in the others. Of names with parents ("construction--flat--road") the last parts count.
+        names: names of the labels, in order; if the best matching set of `LABEL_SETS` has few of them, the others are
+            looked up in the other sets. Of names with parents ("construction--flat--road") the last parts count.
         where: file with the labels, for the error message.
         whole_scene: reject labels of objects alone, as of networks for instances.
 
@@ -128,8 +130,10 @@ def map_labels(names: Sequence[str], where: str, *, whole_scene: bool = True) ->
     """
     parts = [name.split("--") for name in names]
     plain = [[_plain("".join(part[i:])) for i in range(len(part))] for part in parts]
-    best = max(LABEL_SETS.values(), key=lambda table: sum(any(one in table for one in name) for name in plain))
-    table = {label: ours for labels in LABEL_SETS.values() for label, ours in labels.items()} | best
+    matches = [sum(any(one in table for one in name) for name in plain) for table in LABEL_SETS.values()]
+    table = list(LABEL_SETS.values())[int(np.argmax(matches))]
+    if max(matches) < RECOGNIZED:  # names of the user's own, which no set has all of
+        table = {label: ours for labels in LABEL_SETS.values() for label, ours in labels.items()} | table
     found = [next((table[one] for one in name if one in table), None) for name in plain]
     classes = {name for name in found if name}
     partial = len(classes) < 4 or "building" not in classes or not classes & set(GROUND_CLASSES)

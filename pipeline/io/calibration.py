@@ -190,13 +190,16 @@ def camera_of_photos(
         file: file with cameras.
 
     Raises:
-        InputError: no photos, or no focal length. SettingError: unknown model.
+        InputError: no photos, or no focal length. SettingError: unknown model, or a file and a number are given.
     """
     if model not in ("auto", "pinhole", "equirectangular"):
         raise SettingError("camera", f"unknown model {model!r}", "Use auto, pinhole, equirectangular, or a file")
     first = list_files(photos, SUFFIXES, "photos")[0]
     width, height = size_of(first)
     if file is not None:
+        for name, given in (("focal", focal), ("centre", centre)):
+            if given is not None:
+                raise SettingError(f"--{name}", "is given beside a file with the camera", "Leave one of them out")
         return read_camera(file, width, height, names=(photos.resolve().name,))
     if model == "auto" and focal is None and width == 2 * height:
         panorama.check(first, read_levels(first))

@@ -75,6 +75,7 @@ class Network:
         self._set_input(3 + CHANNELS * takes_channels)
         self._outputs = _chosen(self._session.get_outputs(), path)
         labels = onnx_session.read_labels(path, meta)
+        self._check_labels(len(labels))
         self._normalise, assumed = _normalisation(path, meta)
         licence = meta.get("license") or "not stated"
         density = onnx_session.metadata_value(meta.get("pixels_a_radian"), None)
@@ -113,6 +114,16 @@ class Network:
             cause = f"output of {outputs} for {len(self.info.labels)} labels"
             raise InputError(self._path, cause, f"{REMEDY}, and name each of the C labels")
         return probabilities
+
+    def _check_labels(self, labels: int) -> None:
+        """Raise an InputError if the file states that its output has the scores of another number of labels."""
+        (output, *more) = (one for one in self._session.get_outputs() if one.name in self._outputs)
+        shape = _sizes(output.shape)
+        if more or output.type not in onnx_session.FLOATS or len(shape) != 4:
+            return
+        if shape[1] is not None and labels not in (shape[1], shape[3]):
+            remedy = f"{REMEDY}, and name each of the C labels"
+            raise InputError(self._path, f"output {output.name} {output.shape} for {labels} labels", remedy)
 
     def _set_input(self, channels: int) -> None:
         """Name, type, layout and size of the input, of images with this number of channels."""

@@ -11,7 +11,7 @@ from pydantic import Field
 from scan2sim.pipeline.camera.lens import GIVEN_SIGMA, LENS_MODELS
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.blas_threads import one_blas_thread
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate, Shift
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, Camera, GpsTrack
@@ -219,9 +219,12 @@ def video_camera(
     """Camera of the frames: from a file or tile, from the options, or estimated; `cache` stores an estimate.
 
     Raises:
-        InputError: the camera is unknown.
+        InputError: the camera is unknown. SettingError: a file and a number are given.
     """
     if file is not None:
+        for name in ("focal", "centre", "k1", "k2"):
+            if getattr(params, name) is not None:
+                raise SettingError(f"--{name}", "is given beside a file with the camera", "Leave one of them out")
         given: Camera | None = read_camera(file, video.width, video.height, names=(video.path.stem,))
     else:
         given = _tile_camera(video, params) or camera_of(

@@ -142,6 +142,8 @@ def test_other_label_sets_are_mapped_by_name() -> None:
     ]  # fmt: skip
     ade = ["wall", "building, edifice", "sky", "floor, flooring", "tree", "ceiling", "road, route", "bed", "grass"]
     assert map_labels(ade, "")[5] == IGNORED and CLASSES[map_labels(ade, "")[4]] == "high_vegetation"
+    ade += ["building", "car", "person", "sidewalk", "plant", "bench", "lamp", "tent"]
+    assert map_labels(ade, "")[-3:].tolist() == [IGNORED] * 3, "buildings and poles of other sets"
     with pytest.raises(InputError, match="unknown label set"):
         map_labels(["cat", "dog"], "pets.onnx")
 

@@ -87,6 +87,9 @@ def test_camera_of_a_video_is_that_of_a_calibration_and_never_a_model_that_does_
     assert camera(chain) == Camera("fisheye", 160, 120, 90.0, 90.0, 80.0, 60.0, (0.1, 0.02, 0.0, 0.0))
     with pytest.raises(SettingError, match="unknown model 'fisheye'.*or a file"):
         camera(camera="fisheye", focal=500.0)
+    for name, given in {"focal": 500.0, "centre": (80.0, 60.0), "k1": 0.1, "k2": 0.0}.items():
+        with pytest.raises(SettingError, match=f"--{name}.* beside a file with the camera"):
+            camera(chain, **{name: given})
     two = [asdict(Camera("pinhole", 160, 120, focal, focal, 80.0, 60.0)) for focal in (90.0, 95.0)]
     assert camera(context=TrackContext(cameras=tuple(two[:1]))).fx == 90
     with pytest.raises(InputError, match="the tile has several cameras with an image size of 160x120"):

@@ -183,10 +183,10 @@ class Frames:
                 np.degrees(np.arccos(np.clip((np.trace(off) - 2) / 2, -1, 1))),
             )
             if shift > SAME_M or turn > SAME_DEG:
-                texts = (
-                    f"{parent} > {child} of --transform differs by {shift:.3f} m and {turn:.1f} degrees from the bag's"
-                )
-                warnings = [f"{texts}, which isn't used"]
+                warnings = [
+                    f"{parent} > {child} of --transform differs by {shift:.3f} m and {turn:.1f} degrees from what the "
+                    "bag or an earlier --transform says, which isn't used"
+                ]
             del self.static[known[1]]
         self.static[link] = T
         return warnings

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from scan2sim.flows.pipelines.sweeps import Sweeps
 from scan2sim.pipeline.camera.models import project_exactly
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io.calibration import camera_of_photos, read_camera, read_extrinsics
 
@@ -300,6 +300,8 @@ def test_several_cameras_of_one_size_are_told_apart_by_name(tmp_path: Path) -> N
     photos.mkdir()
     cv2.imwrite(str(photos / "0.png"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
     assert camera_of_photos(photos, file=chain).fx == 500
+    with pytest.raises(SettingError, match=r"--focal.* beside a file"):
+        camera_of_photos(photos, file=chain, focal=400.0)
     one = '[[cameras]]\nid = "{}"\nmodel = "pinhole"\nsize = [640, 480]\nfocal = [{}, 400]\ncentre = [320, 240]\n'
     rig = save(tmp_path / "rig.toml", one.format("cam0", 400) + one.format("cam1", 500))
     assert camera_of_photos(photos, file=rig).fx == 500

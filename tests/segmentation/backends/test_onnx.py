@@ -133,8 +133,7 @@ def test_labels_are_read_from_a_text_file(tmp_path: Path) -> None:
     (tmp_path / "net.labels.txt").write_text("", encoding="utf-8")
     assert "line 1 is empty" in error_of(path).cause
     (tmp_path / "net.labels.txt").write_text("road\nsky\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"output of float32 \(1, 4, 16, 24\).* for 2 labels"):
-        load("onnx", path, "cpu").probabilities(photo())
+    assert "for 2 labels" in error_of(path).cause
     (tmp_path / "net.labels.txt").unlink()
     error = error_of(path)
     assert error.where == str(path) and "no labels found" in error.cause and "net.labels.txt" in error.remedy
