@@ -153,6 +153,31 @@ def test_intensities_are_scaled_by_scan(tmp_path: Path) -> None:
     assert np.abs(intensity[0].astype(int) - intensity[1]).max() <= 1 and intensity.max() == 65535
 
 
+def test_limits_of_an_e57_may_be_scaled_integers(tmp_path: Path) -> None:
+    """FARO SCENE writes those of intensities so."""
+    pye57 = pytest.importorskip("pye57", reason="E57 files are written by pye57")
+    libe57, file = pye57.libe57, pye57.E57(str(tmp_path / "c.e57"), mode="w")
+    levels = np.linspace(0, 500, 1000)
+    values = {name: levels.copy() for name in ("cartesianX", "cartesianY", "cartesianZ", "intensity")}
+    owner, buffers = file.image_file, libe57.VectorSourceDestBuffer()
+    scan, limits, point = (libe57.StructureNode(owner) for _ in range(3))
+    for name, column in values.items():
+        point.set(name, libe57.FloatNode(owner, 0.0))
+        buffers.append(libe57.SourceDestBuffer(owner, name, column, 1000, True, True))
+    for end, raw in (("Minimum", 0), ("Maximum", 10_000)):
+        limits.set(f"intensity{end}", libe57.ScaledIntegerNode(owner, raw, 0, 10_000, 0.1, 0.0))
+    points = libe57.CompressedVectorNode(owner, point, libe57.VectorNode(owner, True))
+    for name, node in (("guid", libe57.StringNode(owner, "{scan}")), ("intensityLimits", limits), ("points", points)):
+        scan.set(name, node)
+    file.data3d.append(scan)
+    writer = points.writer(buffers)
+    writer.write(1000)
+    writer.close()
+    file.close()
+    intensity = present(clouds.read(tmp_path / "c.e57", Frame()).intensity)
+    assert np.abs(intensity - 65535 / 1000 * levels).max() <= 1
+
+
 def test_a_tile_has_the_attributes_of_all_clouds(tmp_path: Path) -> None:
     cloud = made(N)
     las.write(tmp_path / "a.laz", cloud)
