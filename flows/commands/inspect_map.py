@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, Frame, PointCloud
-from scan2sim.pipeline.importers.robot_map import UNIT_M, map_files
+from scan2sim.pipeline.importers.robot_map import UNIT_M, is_surveyed, map_files
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import MIN_POINTS
 
@@ -37,7 +37,7 @@ def _facts(xyz: F32, spacing: float, start: F64) -> Facts:
     """Facts of points (N, 3) from a map with a spacing; `start`: of the sensor, in the same axes and unit."""
     from scan2sim.pipeline.geometry.height_map import exact_point_spacing
     from scan2sim.pipeline.geometry.upright import find_up, rotation_to_z
-    from scan2sim.pipeline.robot_maps.describe import describe, guess_unit
+    from scan2sim.pipeline.robot_maps.describe import guess_unit
     from scan2sim.pipeline.robot_maps.outliers import far_outliers
 
     unit = guess_unit(xyz, spacing)
@@ -45,6 +45,8 @@ def _facts(xyz: F32, spacing: float, start: F64) -> Facts:
     outliers = far_outliers(xyz, exact_point_spacing(xyz))
     xyz = xyz[~outliers]
     facts = [("units", f"{unit} (assumed)"), ("outliers", f"{outliers.mean():.1%} isolated or far points")]
+    if is_surveyed(start):
+        return [*facts, ("up axis", "z: coordinates of a survey"), *_scene_facts(xyz, np.eye(3), start, spacing)]
     up = find_up(xyz, start)
     if up is None:
         return [*facts, ("up axis", "not found: no flat surfaces; name it with --up")]
@@ -52,11 +54,16 @@ def _facts(xyz: F32, spacing: float, start: F64) -> Facts:
     tilt = np.degrees(np.arccos(min(1.0, abs(float(up.up[axis])))))
     doubt = ", ambiguous: check it, or name it with --up" if up.ambiguous else ""
     sign = "-" if up.up[axis] < 0 else ""
-    R = rotation_to_z(up.up)
+    axis_fact = ("up axis", f"{sign}{'xyz'[axis]}, tilted by {tilt:.1f} degrees{doubt}")
+    return [*facts, axis_fact, *_scene_facts(xyz, rotation_to_z(up.up), start, spacing)]
+
+
+def _scene_facts(xyz: F32, R: F64, start: F64, spacing: float) -> Facts:
+    """Facts of the surfaces of points (N, 3), metres, by their rotation (3, 3) to a level world."""
+    from scan2sim.pipeline.robot_maps.describe import describe
+
     found = describe(xyz @ R.T.astype(np.float32), R @ start)
     return [
-        *facts,
-        ("up axis", f"{sign}{'xyz'[axis]}, tilted by {tilt:.1f} degrees{doubt}"),
         ("spacing", f"{100 * spacing:.1f} cm between neighbouring points"),
         ("noise", f"{100 * found.noise:.1f} cm around planes"),
         ("surfaces", f"{found.level_share:.0%} level (ground, floors), {found.upright_share:.0%} upright (walls)"),

@@ -37,7 +37,7 @@ from scan2sim.pipeline.robot_maps.label_colours import (
 )
 from scan2sim.pipeline.robot_maps.outliers import below_floor, far_outliers
 
-VERSION = 7
+VERSION = 8
 """Version of the importer: raised when the same input and options give another tile."""
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 MIN_TILT_DEG = 0.5
@@ -50,6 +50,7 @@ USUAL_HEIGHT_M = 100.0
 """Height of a map or mesh above which its assumed unit is doubted: centimetres look like that."""
 FAR_ORIGIN_M = 10_000.0
 """Coordinates above this need an origin of their own to fit into float32."""
+SURVEYED = "z is up: the coordinates are those of a survey, more than 10 km from their origin"
 AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1), "-z": (0, 0, -1),
 }  # fmt: skip
@@ -295,6 +296,9 @@ def level_rotation(xyz: F32, params: MapParams, origin: F64, warn: Callable[[str
         warn: receives the tilt, and whether it is ambiguous.
     """
     coarse = np.eye(3) if params.up == "auto" else rotation_to_z(np.array(AXES[params.up], np.float64))
+    if params.up == "auto" and is_surveyed(origin):
+        warn(SURVEYED)
+        return coarse
     found = find_up(xyz @ coarse.T.astype(np.float32), -(coarse @ origin))
     if found is None:
         if params.up == "auto":
@@ -315,6 +319,12 @@ def level_rotation(xyz: F32, params: MapParams, origin: F64, warn: Callable[[str
     R = rotation_to_z(found.up) @ coarse
     warn(_tilt_text(found, R))
     return R
+
+
+def is_surveyed(origin: F64) -> bool:
+    """Whether a map at `origin` (3,), metres, has the eastings, northings and heights of a survey: z is up."""
+    far = np.abs(origin) > FAR_ORIGIN_M
+    return bool(far[:2].all() and not far[2])
 
 
 def _nearest_axis(up: F64) -> F64:
