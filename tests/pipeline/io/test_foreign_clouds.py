@@ -553,6 +553,25 @@ def test_labels_that_are_no_las_codes_are_unclassified_and_counted(tmp_path: Pat
     assert present(clouds.read(path, Frame()).classification)[:4].tolist() == [2, 6, 1, 1]
 
 
+def test_labels_of_a_pcd_are_noted(tmp_path: Path) -> None:
+    """PCL's labels are often those of segments."""
+    head = "FIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n"
+    (tmp_path / "c.pcd").write_text(head + "0 0 0 1\n1 1 1 2\n", encoding="ascii")
+    assert any("field `label` is read as LAS classes" in note for note in clouds.read_header(tmp_path / "c.pcd").notes)
+
+
+def test_points_of_a_ply_may_end_with_their_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    """A mesh without faces, or whose faces are in the next block: no warning of numpy appears."""
+    head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+    points = "0 0 0\n1 1 1\n"
+    (tmp_path / "c.ply").write_text(f"{head}element note 1\nproperty int n\nend_header\n{points}7\n", encoding="ascii")
+    monkeypatch.setattr("scan2sim.pipeline.io.number_text.BLOCK_BYTES", len(points))
+    assert clouds.read_header(tmp_path / "c.ply").count == 2
+    assert not recwarn.list
+
+
 def test_labels_of_a_named_data_set_are_mapped(tmp_path: Path) -> None:
     """SemanticKITTI's 10 is a car, not LAS's rail; 11 a bicycle, not a road; codes that it doesn't have, no class."""
     labels = np.resize([40, 48, 50, 70, 72, 80, 81, 10, 11, 18, 30, 99, 252], N)
