@@ -219,11 +219,15 @@ def _look(shape: trimesh.Trimesh) -> tuple[F32 | None, U8, Any]:
         return None, colour, None
     material: Any = visual.material
     image, tint = getattr(material, "image", None), None
+    if image is not None and _is_placeholder(image):
+        image = None
     if hasattr(material, "baseColorTexture"):
         image, tint = material.baseColorTexture, material.baseColorFactor
     elif image is None:
         tint = getattr(material, "kwargs", {}).get("kd")  # the factor of an image is often wrong in OBJ
     per_vertex = visual.vertex_attributes.get("color")
+    if per_vertex is None and image is None:
+        per_vertex = _own_colours(shape, tint is not None)
     uv = None if visual.uv is None or len(visual.uv) != len(shape.vertices) else np.asarray(visual.uv)[faces]
     if image is not None and uv is not None:
         colour[:] = 255
@@ -236,6 +240,18 @@ def _look(shape: trimesh.Trimesh) -> tuple[F32 | None, U8, Any]:
         own = np.clip(level, 0, 255)[faces][..., :3]
         colour = (own if image is None else own * (colour / 255.0)).astype(np.uint8)
     return (None if uv is None else uv.astype(np.float32)), colour, image if uv is not None else None
+
+
+def _is_placeholder(image: Any) -> bool:
+    """Whether an image is trimesh's own, of meshes with texture coordinates whose material or image is missing."""
+    own = trimesh.visual.material.color_image()
+    return bool(image.size == own.size and image.mode == own.mode and image.tobytes() == own.tobytes())
+
+
+def _own_colours(shape: trimesh.Trimesh, tinted: bool) -> Any:
+    """Colours of the vertices beside texture coordinates without an image; of a tinted mesh only if they vary."""
+    found = shape.vertex_attributes.get("color")
+    return None if found is None or (tinted and not np.ptp(np.asarray(found)[:, :3], axis=0).any()) else found
 
 
 def _merged(parts: list[_Part], path: Path, notes: list[str]) -> SourceMesh:
