@@ -28,6 +28,8 @@ from scan2sim.pipeline.plausibility.check import find_implausible
 from scan2sim.pipeline.pose_check.check import find_mistake
 
 app = App()
+MAX_MATERIALS = 20
+"""Materials of a mesh that are listed."""
 
 
 @app.command()
@@ -206,17 +208,19 @@ def _mesh(path: Path) -> tuple[str, Facts]:
 
     try:
         loaded = trimesh.load_scene(path, process=False)
-        meshes = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh)]
+        shapes = [loaded.geometry[loaded.graph[node][1]] for node in loaded.graph.nodes_geometry]
+        meshes = [shape for shape in shapes if isinstance(shape, trimesh.Trimesh)]
         bounds = loaded.bounds
     except Exception as error:  # trimesh's parsers raise any exception on damaged files
         raise InputError(path, f"is not a readable mesh ({error})", "Export it again") from None
-    textures = {getattr(getattr(m.visual, "material", None), "name", None) for m in meshes} - {None}
+    names = sorted({str(getattr(getattr(m.visual, "material", None), "name", None)) for m in meshes} - {"None"})
+    others = f" and {len(names) - MAX_MATERIALS} others" if len(names) > MAX_MATERIALS else ""
     return "mesh", [
         ("parts", str(len(meshes))),
         ("triangles", f"{sum(len(m.faces) for m in meshes):,}"),
         ("vertices", f"{sum(len(m.vertices) for m in meshes):,}"),
         ("extent", _bounds(*bounds) if bounds is not None else "empty"),
-        ("materials", ", ".join(sorted(map(str, textures))) or "none"),
+        ("materials", (", ".join(names[:MAX_MATERIALS]) or "none") + others),
         *(mesh_facts(path) if is_mesh(path) else []),
     ]
 

@@ -74,3 +74,13 @@ def test_up_axis_of_a_gltf_is_named_in_its_own_axes(tmp_path: Path) -> None:
     scene.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
     scene.export(tmp_path / "z_up.glb")
     assert facts(tmp_path / "z_up.glb")["up axis"].startswith("z,")
+
+
+def test_triangles_of_a_mesh_include_repeated_parts(tmp_path: Path) -> None:
+    scene = trimesh.Scene({"box": trimesh.creation.box((4.0, 2.0, 2.5))})
+    for x in (8.0, 16.0):
+        shift = trimesh.transformations.translation_matrix((x, 0, 0))
+        scene.graph.update(frame_from="world", frame_to=f"at {x}", matrix=shift, geometry="box")
+    scene.export(tmp_path / "boxes.glb")
+    found = facts(tmp_path / "boxes.glb")
+    assert (found["parts"], found["triangles"]) == ("3", "36")
