@@ -10,7 +10,7 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -18,7 +18,7 @@ from trimesh.resolvers import Resolver
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, F64, I64, U8, UNCOLOURED, Bools, Frame, Mesh
-from scan2sim.pipeline.io import file_checks, foreign_files, gltf_features
+from scan2sim.pipeline.io import file_checks, foreign_files, gltf_features, obj_faces
 from scan2sim.pipeline.io.images.image import MAX_PIXELS
 from scan2sim.pipeline.io.mesh_files import SUFFIXES, find_beside, ply_textures
 from scan2sim.pipeline.io.source_mesh import SourceMesh, encoded
@@ -113,7 +113,7 @@ def _load(path: Path, folder: _Folder) -> trimesh.Scene:
     if path.suffix.lower() in (".gltf", ".glb"):
         gltf_features.check(path)
     try:
-        with open(path, "rb") as file:
+        with _opened(path) as file:
             return trimesh.load_scene(
                 file, file_type=path.suffix[1:].lower(), resolver=folder, process=False, skip_materials=False
             )
@@ -125,6 +125,13 @@ def _load(path: Path, folder: _Folder) -> trimesh.Scene:
         missing = f"; not found: {', '.join(folder.missing)}" if folder.missing else ""
         cause = f"can't be read as a mesh ({type(error).__name__}: {error}{missing})"
         raise InputError(path, cause, REMEDY) from None
+
+
+def _opened(path: Path) -> IO[Any]:
+    """The file; of an OBJ its text as trimesh reads it rightly."""
+    if path.suffix.lower() != ".obj":
+        return path.open("rb")
+    return io.StringIO(obj_faces.rewritten(trimesh.util.decode_text(path.read_bytes())))
 
 
 def _head(path: Path) -> bytes:
