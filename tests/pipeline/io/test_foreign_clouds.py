@@ -97,6 +97,26 @@ def test_a_file_of_withheld_points_only_is_refused(tmp_path: Path) -> None:
             use()
 
 
+def test_times_that_are_not_numbers_are_none(tmp_path: Path) -> None:
+    flagged(tmp_path / "c.las", 0)
+    data = laspy.read(tmp_path / "c.las")
+    data.gps_time = np.full(N, np.nan)
+    data.write(tmp_path / "c.las")
+    (tmp_path / "c.csv").write_text("x,y,z,time\n" + "1,2,3,nan\n4,5,6,nan\n", encoding="ascii")
+    for name in ("c.las", "c.csv"):
+        assert clouds.read(tmp_path / name, FRAME).time is None
+
+
+def test_node_of_an_ept_with_too_many_points_is_named(tmp_path: Path) -> None:
+    ept("laszip")(tmp_path / "ept.json", made(N))
+    node = tmp_path / "ept-data" / "0-0-0-0.laz"
+    points = laspy.read(node)
+    points.points = points.points[np.arange(len(points)).repeat(2)]
+    points.write(node)
+    with pytest.raises(InputError, match=r"0-0-0-0\.laz: .*it has [\d,]+ points, the hierarchy says"):
+        clouds.read_header(tmp_path / "ept.json")
+
+
 def test_withheld_points_of_an_ept_are_not_used(tmp_path: Path) -> None:
     ept("laszip")(tmp_path / "ept.json", made(N))
     for file in (tmp_path / "ept-data").iterdir():
