@@ -35,6 +35,14 @@ class LabelSet(NamedTuple):
         return las | {label: CODE[name] for label, name in self.classes.items() if label < 256}
 
 
+def field_notes(field: str | None) -> tuple[str, ...]:
+    """Note on how a cloud's field of labels is read, if it isn't named as LAS's classes."""
+    if field is None or field.endswith("classification"):
+        return ()
+    how = "LAS classes (2 ground, 6 building, ...); map other codes from 0 to 255 with --classes"
+    return (f"field `{field}` is read as {how}",)
+
+
 def _labels(**labels: tuple[int, ...]) -> dict[int, str]:
     """Class by label, from labels by class."""
     return {label: name for name, many in labels.items() for label in many}
