@@ -41,7 +41,7 @@ COMMANDS = {
     "verify": ("verify", "Check all results against their checksums; the next run rebuilds the damaged ones."),
     "inspect": (
         "inspect",
-        "Show a summary of a point cloud, a folder of clouds, a tile, a mesh, a world or a ROS bag.",
+        "Show a summary of a point cloud, a folder of clouds, a tile, a mesh, a world, a trajectory or a ROS bag.",
     ),
     "scenario": ("scenario", "List and vary the recorded traffic of a finished world."),
     "import": ("imports", "Import recordings: create a tile from point clouds, photos, sweeps, ROS bags or data sets."),

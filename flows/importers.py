@@ -230,6 +230,7 @@ def import_kitti_odometry(
     pose_source: PoseSource = "auto",
     max_range: float = 50.0,
     vertical_angle_offset: float = 0.0,
+    labels: str | Path | None = None,
     name: str | None = None,
     link: bool = False,
     overwrite: bool = False,
@@ -243,6 +244,7 @@ def import_kitti_odometry(
         sequence: folder with velodyne/, image_2/ ..., calib.txt and times.txt.
         poses: poses of camera 0, row-major 3x4, one per line; default: `poses.txt` in the sequence, or the data set's
             `../../poses/<sequence>.txt`.
+        labels: folder of labels (`NNNNNN.label`) of SemanticKITTI, or predicted in its format: the points' classes.
         out, cameras, frames, pose_source, max_range, vertical_angle_offset: as in `import_kitti_raw`.
         name, link, overwrite, progress, warn, report: as in `import_clouds`.
 
@@ -254,7 +256,7 @@ def import_kitti_odometry(
     """
     from scan2sim.flows.pipelines import kitti
 
-    make = partial(kitti.import_kitti_odometry, Path(sequence))
+    make = partial(kitti.import_kitti_odometry, Path(sequence), labels=_path(labels))
     return _kitti(
         "import_kitti_odometry", make, out, progress, warn, report, cameras, max_range, vertical_angle_offset,
         poses=_path(poses), frames=frames, pose_source=pose_source, name=name, link=link, overwrite=overwrite,

@@ -10,6 +10,8 @@ from typing import Any
 
 from scan2sim.pipeline.core.cores import available_cores
 from scan2sim.pipeline.core.errors import InputError, SettingError
+from scan2sim.segmentation.huggingface import CONFIG, beside, label_names, read_json
+from scan2sim.segmentation.labels import read_names
 
 FLOATS = {"tensor(float)": "float32", "tensor(float16)": "float16"}
 """NumPy type by ONNX type of the supported inputs."""
@@ -43,6 +45,10 @@ def open_session(path: Path, device: str, setting: str) -> Any:
         session = onnxruntime.InferenceSession(path, options, [*providers, "CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's errors have no common base class
         remedy = "Copy or export it again, with its .data file if it has one"
+        if "opset" in str(error).lower() or "IR version" in str(error):
+            remedy = (
+                f"Update onnxruntime ({onnxruntime.__version__} here), or export it with an older opset, such as 17"
+            )
         raise session_error(error, path, "can't be loaded", remedy) from None
     if device.startswith("cuda") and CUDA not in session.get_providers():
         raise SettingError(setting, f"onnxruntime can't use {device!r} here", "Install onnxruntime-gpu, or set cpu")
@@ -75,25 +81,34 @@ def metadata_value(text: str | None, default: object) -> Any:
         return text
 
 
+def config_labels(path: Path) -> tuple[str, ...] | None:
+    """Names of a network's classes in Hugging Face's `config.json` beside its file; None if it has none.
+
+    Raises:
+        InputError: they are invalid.
+    """
+    file = beside(path, CONFIG)
+    config = read_json(file, "Copy it again from the network's author") if file else {}
+    return label_names(config, file) if file and "id2label" in config else None
+
+
 def read_labels(path: Path, metadata: dict[str, str]) -> tuple[str, ...]:
-    """Names of a network's classes, from its metadata "labels", or from `<name>.labels.txt`, one per line.
+    """Names of a network's classes: metadata "labels", else `<name>.labels.txt`, one per line, else `config_labels`.
 
     Raises:
         InputError: the labels are missing or invalid.
     """
     label_file = path.with_suffix(".labels.txt")
     remedy = f'Name them in order of the channels: metadata "labels" as a JSON list, or {label_file.name}, one per line'
-    try:
-        names = metadata_value(metadata.get("labels"), None) or [
-            line.strip() for line in label_file.read_text("utf-8-sig").split("\n")
-        ]
-    except FileNotFoundError:
-        raise InputError(path, "no labels found for the network's classes", remedy) from None
-    except (OSError, ValueError) as error:
-        raise InputError(label_file, f"can't be read ({error})", remedy) from None
-    if not isinstance(names, list) or not any(names) or not all(isinstance(name, str) for name in names):
+    names = metadata_value(metadata.get("labels"), None)
+    if not names and label_file.is_file():
+        return tuple(read_names(label_file))
+    names = names or config_labels(path)
+    if names is None:
+        raise InputError(path, "no labels found for the network's classes", remedy)
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) and name for name in names):
         raise InputError(path, "labels are not a list of names", remedy)
-    return tuple(name for name in names if name)
+    return tuple(names)
 
 
 def _threads() -> int:

@@ -22,7 +22,8 @@ OUTPUT_STRIDE = 4
 """Probabilities are stored at 1/4 of the resolution at which photos are classified."""
 MAX_UPSCALING = 1.6
 """Largest factor by which photos are enlarged."""
-
+MIN_WARNED_SHARE = 0.03
+"""Share of the photos from which a label without a class is worth a warning."""
 SIDEWAYS_MIN = 0.5
 """Least cosine between a photo's plane and the vertical; cameras that look more steeply have no upright photo."""
 
@@ -59,6 +60,20 @@ class Classifier:
         self.classes = tuple(name for name, row in zip(CLASSES, self._merge, strict=True) if row.any())
         self.takes_channels = network.info.channels
         self.tile = MAX_TILE_PX
+        self._label_shares, self._tiles = np.zeros(len(index)), 0
+
+    def warnings(self) -> list[str]:
+        """What was assumed about the network's input, and labels without a class in the photos that it classified."""
+        found = [f"{self._network.info.name}: {self._network.info.assumed}"] if self._network.info.assumed else []
+        shares = np.where(self._merge.any(axis=0), 0.0, self._label_shares / max(self._tiles, 1))
+        frequent = [i for i in np.argsort(-shares).tolist() if shares[i] >= MIN_WARNED_SHARE]
+        if frequent:
+            names = ", ".join(f"{self._network.info.labels[i]} ({shares[i]:.0%})" for i in frequent[:8])
+            found.append(
+                f"{self._network.info.name}: labels of the photos that are no class and don't count: {names}. If they "
+                f"belong to a class, name them after it: {', '.join(CLASSES)}"
+            )
+        return found
 
     def probabilities(self, rgb: U8, camera: Camera, channels: U8 | None = None, turns: int = 0) -> U8:
         """(h, w, C) uint8 probabilities (255 for 1) by class of `CLASSES`, at 1/`OUTPUT_STRIDE` of `size`.
@@ -103,10 +118,11 @@ class Classifier:
         out = np.zeros((max(1, height // OUTPUT_STRIDE), max(1, width // OUTPUT_STRIDE), len(CLASSES)), np.float32)
         weight = np.zeros(out.shape[:2], np.float32)
         while True:
+            tile = self._tile_size(height, width)
             try:
-                for top in _starts(height, self.tile):
-                    for left in _starts(width, self.tile):
-                        self._add_tile(image, top, left, out, weight)
+                for top in _starts(height, tile[0]):
+                    for left in _starts(width, tile[1]):
+                        self._add_tile(image[top : top + tile[0], left : left + tile[1]], top, left, out, weight)
                 break
             except MemoryError:
                 if self.tile // 2 < MIN_TILE_PX:
@@ -115,12 +131,27 @@ class Classifier:
                 out[:], weight[:] = 0, 0
         return np.asarray(np.clip(out / np.maximum(weight, 1e-6)[..., None] * 255 + 0.5, 0, 255), np.uint8)
 
-    def _add_tile(self, image: U8, top: int, left: int, out: F32, weight: F32) -> None:
+    def _tile_size(self, height: int, width: int) -> tuple[int, int]:
+        """Height and width of the tiles of an image: of the network's proportions, if its input has a fixed size."""
+        fixed = self._network.info.size
+        if fixed is None:
+            return self.tile, self.tile
+        factor = min(self.tile / max(fixed), height / fixed[0], width / fixed[1])
+
+        def side(length: int, own: int) -> int:
+            """A multiple of the stride, at which tiles begin, or the whole length: else its last pixels had no tile."""
+            n = round(own * factor)
+            return length if n >= length else max(1, n // OUTPUT_STRIDE) * OUTPUT_STRIDE
+
+        return side(height, fixed[0]), side(width, fixed[1])
+
+    def _add_tile(self, part: U8, top: int, left: int, out: F32, weight: F32) -> None:
         """Add a tile's probabilities, with weights that fall towards its borders."""
         import cv2
 
-        part = image[top : top + self.tile, left : left + self.tile]
         found = self._network.probabilities(part)
+        self._label_shares += found.mean(axis=(1, 2))
+        self._tiles += 1
         merged = np.tensordot(self._merge, found, axes=1).transpose(1, 2, 0)
         y, x = top // OUTPUT_STRIDE, left // OUTPUT_STRIDE
         h, w = (
@@ -134,10 +165,11 @@ class Classifier:
 
 
 def _starts(length: int, tile: int) -> list[int]:
-    """First pixels of tiles that cover a length with at least `TILE_OVERLAP_PX`; multiples of `OUTPUT_STRIDE`."""
+    """First pixels of tiles that cover a length with an overlap; multiples of `OUTPUT_STRIDE`."""
     if length <= tile:
         return [0]
-    n = math.ceil((length - TILE_OVERLAP_PX) / (tile - TILE_OVERLAP_PX))
+    overlap = min(TILE_OVERLAP_PX, tile // 2)
+    n = math.ceil((length - overlap) / (tile - overlap))
     return [int((length - tile) * i / (n - 1)) // OUTPUT_STRIDE * OUTPUT_STRIDE for i in range(n)]
 
 
@@ -148,6 +180,8 @@ def _ramp(n: int) -> F32:
 
 def class_map(probabilities: U8, size: tuple[int, int]) -> tuple[U8, U8]:
     """(H, W) index of the most probable class of every pixel, and (H, W) its probability (255 for 1).
+
+    The index is `IGNORED` where labels without a class are more probable than all classes.
 
     Args:
         probabilities: (h, w, C) from `Classifier.probabilities`.
@@ -160,4 +194,6 @@ def class_map(probabilities: U8, size: tuple[int, int]) -> tuple[U8, U8]:
         layer = cv2.resize(probabilities[..., k], size[::-1], interpolation=cv2.INTER_LINEAR)
         better = layer > confidence
         best[better], confidence[better] = k, layer[better]
+    known = probabilities.sum(axis=2, dtype=np.float32)
+    best[cv2.resize(known, size[::-1], interpolation=cv2.INTER_LINEAR) < 127] = IGNORED
     return best, confidence

@@ -18,6 +18,7 @@ FOREIGN = {
     "preserveboundary", "timebase", "point_time_offset", "time_offset_ns", "up_axis", "LoadNVM",
     "SetNormalizedMeasurementDistortion", "mj_multiRay", "qualityLevel", "save_pretrained", "timeout_keep_alive",
     "limit_concurrency", "stop_pub_timeout", "Stamp", "descriptor_set_out", "include_imports",
+    "camN", "camera_matrix", "distortion_coefficients", "CameraMat", "DistCoeff", "CameraExtrinsicMat",
 }  # fmt: skip
 """Names in other programs, protocols and file formats."""
 BUILT = {

@@ -25,7 +25,7 @@ from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.classes import SURFACES
 from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.importers.bag import reader
-from scan2sim.pipeline.io import clouds, gps, mesh_files, sweep_files
+from scan2sim.pipeline.io import camera_calibrations, clouds, gps, mesh_files, sweep_files
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.survey import SurveyFile
 from scan2sim.pipeline.io.tile import TileFile
@@ -236,6 +236,7 @@ def rows_of(page: str) -> dict[str, list[str]]:
         ("lidar sweeps, one file each", set(sweep_files.SWEEP_SUFFIXES)),
         ("a GPS track", set(plugins.by_suffix(gps.__name__))),
         ("a textured mesh", set(mesh_files.SUFFIXES)),
+        ("the calibration of your camera", {*camera_calibrations.SUFFIXES, ".toml"}),
     ],
 )
 def test_the_page_of_inputs_lists_what_the_readers_read(row: str, read: set[str]) -> None:

@@ -127,7 +127,8 @@ Classes = Annotated[
     str,
     typer.Option(
         metavar="CODE=CLASS,...",
-        help="Meaning of the cloud's class codes, such as 65=noise,200=5 (docs/reference/formats.md).",
+        help="Meaning of the cloud's class codes, such as 65=noise,200=5, or the name of a data set: SemanticKITTI "
+        "(docs/reference/formats.md#classes).",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]

@@ -16,12 +16,12 @@ from scan2sim.flows.commands.robot_map import NoImages, map_params
 from scan2sim.flows.commands.sweeps import cached_check, run_before_import
 from scan2sim.flows.pipelines import assembled, bag, dataset, images, kitti, sweeps
 from scan2sim.flows.pipelines.graph import Task
-from scan2sim.pipeline.core.classes import parse_mapping
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.importers.clouds_and_photos import import_las
 from scan2sim.pipeline.importers.mesh_model import import_mesh
 from scan2sim.pipeline.importers.photogrammetry import import_model
 from scan2sim.pipeline.importers.robot_map import MapParams, import_map, map_files
+from scan2sim.pipeline.io.label_sets import parse_classes
 from scan2sim.pipeline.io.mesh_files import find_mesh
 from scan2sim.pipeline.io.tile_folder import check_target
 from scan2sim.pipeline.pose_check.check import check_photos
@@ -104,6 +104,10 @@ def import_kitti_sequence(
     pose_source: PoseSource = "auto",
     max_range: MaxRange = 50.0,
     vertical_angle_offset: VerticalAngleOffset = 0.0,
+    labels: Annotated[
+        Path | None,
+        typer.Option(help="Folder of labels (NNNNNN.label) of SemanticKITTI, or predicted in its format: classes."),
+    ] = None,
     name: Name = None,
     link: Link = False,
     overwrite: Overwrite = False,
@@ -118,7 +122,7 @@ def import_kitti_sequence(
     with progress("import") as report:
         path = kitti.import_kitti_odometry(
             sequence, out, poses=poses, cameras=camera or ["image_2"], max_range=max_range, name=name, link=link,
-            vertical_angle_offset=vertical_angle_offset, pose_source=source, trajectory_check=check,
+            vertical_angle_offset=vertical_angle_offset, labels=labels, pose_source=source, trajectory_check=check,
             overwrite=overwrite, warn=warnings.append, report=report,
         )  # fmt: skip
         report(1.0, CHECKING_PHOTOS)
@@ -163,7 +167,7 @@ def _import_model(kind: str, about: str) -> None:
         with progress("import") as report:
             path = import_model(
                 kind, model, images, out, cloud=cloud, crs=crs, gps=gps, up="photos" if upright else None, scale=scale,
-                classes=parse_mapping(classes), name=name, link=link, overwrite=overwrite, warn=warnings.append,
+                classes=parse_classes(classes), name=name, link=link, overwrite=overwrite, warn=warnings.append,
                 report=report,
             )  # fmt: skip
             if cloud is not None:
@@ -241,7 +245,7 @@ def import_plain_clouds(
     with progress("import") as report:
         path = import_las(
             clouds, out, photos=photos, cameras=cameras, images=images, embedded_images=not no_images, crs=crs,
-            units=units, axes=axes, trajectory=trajectory, trajectory_check=check, classes=parse_mapping(classes),
+            units=units, axes=axes, trajectory=trajectory, trajectory_check=check, classes=parse_classes(classes),
             orthophoto=orthophoto, footprints=footprints, conventions=conventions, name=name, link=link,
             overwrite=overwrite, warn=warnings.append, report=report,
         )  # fmt: skip
@@ -367,7 +371,7 @@ def import_unposed_photos(
     assert isinstance(params, import_photos.ImportPhotosParams)
     with progress("import") as report:
         tile = import_photos.build_tile(
-            inputs, params, out, classes=parse_mapping(classes), name=name, link=link, overwrite=overwrite,
+            inputs, params, out, classes=parse_classes(classes), name=name, link=link, overwrite=overwrite,
             warn=warnings.append, report=report,
         )  # fmt: skip
     _print_imported(tile, warnings)

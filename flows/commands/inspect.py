@@ -1,4 +1,4 @@
-"""`scan2sim inspect`: prints a summary of a point cloud, a folder of clouds, a tile, a mesh, a world or a ROS bag."""
+"""`scan2sim inspect`: prints a summary of a cloud, folder of clouds, tile, mesh, world, trajectory or bag."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scan2sim.pipeline.core.classes import name_of
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Frame, Tile
 from scan2sim.pipeline.importers.bag.reader import is_bag
-from scan2sim.pipeline.io import clouds, file_checks, foreign_files, sbet, xml
+from scan2sim.pipeline.io import clouds, file_checks, foreign_files, sbet, trajectory, xml
 from scan2sim.pipeline.io.geodata.crs import name as crs_name
 from scan2sim.pipeline.io.mesh_files import find_mesh, is_mesh
 from scan2sim.pipeline.io.tile import read_tile
@@ -28,18 +28,23 @@ from scan2sim.pipeline.plausibility.check import find_implausible
 from scan2sim.pipeline.pose_check.check import find_mistake
 
 app = App()
+MAX_MATERIALS = 20
+"""Materials of a mesh that are listed."""
 
 
 @app.command()
 def inspect(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="A point cloud, folder of clouds, tile, mesh, world or ROS bag.")
+        Path,
+        typer.Argument(
+            metavar="PATH", help="A point cloud, folder of clouds, tile, mesh, world, trajectory or ROS bag."
+        ),
     ],
     urdf: Annotated[
         Path | None, typer.Option(help="URDF file of the robot, whose fixed joints the import of a ROS bag would use.")
     ] = None,
 ) -> None:
-    """Show a summary of a point cloud, a folder of clouds, a tile, a mesh, a world or a ROS bag."""
+    """Show a summary of a point cloud, a folder of clouds, a tile, a mesh, a world, a trajectory or a ROS bag."""
     inspect_path(path, urdf)
 
 
@@ -78,7 +83,7 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
         raise InputError(
             path,
             "contains neither a tile.toml, nor a world, a mesh or clouds",
-            "Name a cloud, a tile (or one of a survey), a mesh, a world or a ROS bag",
+            "Name a cloud, a tile (or one of a survey), a mesh, a world, a trajectory or a ROS bag",
         )
     file_checks.check(path, "Check the path")
     readers = {
@@ -89,6 +94,8 @@ def _reader(path: Path) -> Callable[[Path], tuple[str, Facts]]:
         return readers[path.name]
     if sbet.is_sbet(path):
         return _sbet
+    if trajectory.is_trajectory(path):
+        return _trajectory
     if path.suffix.lower() not in readers:
         cause = f"has an unknown file type ({path.suffix or 'no suffix'})"
         raise foreign_files.unread(path, cause, f"Known: {' '.join(readers)}")
@@ -146,6 +153,26 @@ def _sbet(path: Path) -> tuple[str, Facts]:
     return "SBET trajectory", facts
 
 
+def _trajectory(path: Path) -> tuple[str, Facts]:
+    try:
+        found, timed = trajectory.read(path, timed=True), True
+    except InputError:
+        found, timed = trajectory.read(path), False
+    span = float(found.times[-1] - found.times[0])
+    length = float(np.linalg.norm(np.diff(found.positions, axis=0), axis=1).sum())
+    times = f"{found.times[0]:.3f} to {found.times[-1]:.3f} s, {(len(found) - 1) / max(span, 1e-9):,.1f} Hz"
+    uses = ["`import clouds CLOUD --trajectory`"] if timed else []
+    uses += ["`import sweeps SWEEPS`"] if found.rotations is not None else []
+    return "trajectory", [
+        ("poses", f"{len(found):,}"),
+        ("times", times if timed else f"none: {trajectory.KITTI_RATE_HZ:g} poses per second are assumed"),
+        ("extent", _bounds(found.positions.min(axis=0), found.positions.max(axis=0))),
+        ("length", f"{length:,.1f} in units of its coordinates"),
+        ("rotations", "no" if found.rotations is None else "yes"),
+        ("use", f"the scanner's path: {' or '.join(uses)}"),
+    ]
+
+
 def _mistake(tile: Tile) -> str | None:
     """Warning of a usual mistake in the poses of a tile's photos, or that they couldn't be checked."""
     try:
@@ -181,17 +208,19 @@ def _mesh(path: Path) -> tuple[str, Facts]:
 
     try:
         loaded = trimesh.load_scene(path, process=False)
-        meshes = [part for part in loaded.geometry.values() if isinstance(part, trimesh.Trimesh)]
+        shapes = [loaded.geometry[loaded.graph[node][1]] for node in loaded.graph.nodes_geometry]
+        meshes = [shape for shape in shapes if isinstance(shape, trimesh.Trimesh)]
         bounds = loaded.bounds
     except Exception as error:  # trimesh's parsers raise any exception on damaged files
         raise InputError(path, f"is not a readable mesh ({error})", "Export it again") from None
-    textures = {getattr(getattr(m.visual, "material", None), "name", None) for m in meshes} - {None}
+    names = sorted({str(getattr(getattr(m.visual, "material", None), "name", None)) for m in meshes} - {"None"})
+    others = f" and {len(names) - MAX_MATERIALS} others" if len(names) > MAX_MATERIALS else ""
     return "mesh", [
         ("parts", str(len(meshes))),
         ("triangles", f"{sum(len(m.faces) for m in meshes):,}"),
         ("vertices", f"{sum(len(m.vertices) for m in meshes):,}"),
         ("extent", _bounds(*bounds) if bounds is not None else "empty"),
-        ("materials", ", ".join(sorted(map(str, textures))) or "none"),
+        ("materials", (", ".join(names[:MAX_MATERIALS]) or "none") + others),
         *(mesh_facts(path) if is_mesh(path) else []),
     ]
 

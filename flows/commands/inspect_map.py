@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64, Frame, PointCloud
-from scan2sim.pipeline.importers.robot_map import UNIT_M, map_files
+from scan2sim.pipeline.importers.robot_map import UNIT_M, axis_name, is_surveyed, map_files
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import MIN_POINTS
 
@@ -18,45 +18,65 @@ MESH_POINTS = 30_000
 """Points of a mesh that are inspected: fewer, as they have no noise."""
 
 
-def map_facts(cloud: PointCloud, most: int = MAX_POINTS) -> Facts:
+def map_facts(cloud: PointCloud, most: int = MAX_POINTS, usual: F64 | None = None, unit: str = "") -> Facts:
     """Unit, outliers, up axis and tilt, spacing, noise, surfaces and scene; empty for fewer points than a map has.
 
     Args:
         cloud: the map.
         most: number of points that are inspected.
+        usual, unit: see `_facts`.
     """
     from scan2sim.pipeline.geometry.height_map import exact_point_spacing
 
     xyz = cloud.xyz[np.isfinite(cloud.xyz).all(axis=1)]
     if len(xyz) < MIN_POINTS:
         return []
-    return _facts(xyz[:: max(1, len(xyz) // most)], exact_point_spacing(xyz), -np.asarray(cloud.frame.origin))
+    start = -np.asarray(cloud.frame.origin)
+    return _facts(xyz[:: max(1, len(xyz) // most)], exact_point_spacing(xyz), start, usual, unit)
 
 
-def _facts(xyz: F32, spacing: float, start: F64) -> Facts:
-    """Facts of points (N, 3) from a map with a spacing; `start`: of the sensor, in the same axes and unit."""
+def _facts(xyz: F32, spacing: float, start: F64, usual: F64 | None = None, unit: str = "") -> Facts:
+    """Facts of points (N, 3) from a map with a spacing.
+
+    Args:
+        xyz: points in the axes and unit of the map.
+        spacing: of all its points, in the same unit.
+        start: (3,) position of the sensor, likewise.
+        usual: (3, 3) rotation to z up by the specification of the map's format; None: z is up.
+        unit: by the specification; empty: guessed.
+    """
     from scan2sim.pipeline.geometry.height_map import exact_point_spacing
     from scan2sim.pipeline.geometry.upright import find_up, rotation_to_z
-    from scan2sim.pipeline.robot_maps.describe import describe, guess_unit
+    from scan2sim.pipeline.robot_maps.describe import guess_unit
     from scan2sim.pipeline.robot_maps.outliers import far_outliers
 
-    unit = guess_unit(xyz, spacing)
+    usual, unit = np.eye(3) if usual is None else usual, unit or guess_unit(xyz, spacing)
     xyz, start, spacing = xyz * np.float32(UNIT_M[unit]), start * UNIT_M[unit], spacing * UNIT_M[unit]
     outliers = far_outliers(xyz, exact_point_spacing(xyz))
-    xyz = xyz[~outliers]
+    xyz, start = xyz[~outliers] @ usual.T.astype(np.float32), usual @ start
     facts = [("units", f"{unit} (assumed)"), ("outliers", f"{outliers.mean():.1%} isolated or far points")]
+    if is_surveyed(start):
+        return [
+            *facts,
+            ("up axis", f"{axis_name(usual[2])}: coordinates of a survey"),
+            *_scene_facts(xyz, np.eye(3), start, spacing),
+        ]
     up = find_up(xyz, start)
     if up is None:
         return [*facts, ("up axis", "not found: no flat surfaces; name it with --up")]
-    axis = int(np.abs(up.up).argmax())
-    tilt = np.degrees(np.arccos(min(1.0, abs(float(up.up[axis])))))
+    found = up.up @ usual  # in the map's axes
+    tilt = np.degrees(np.arccos(min(1.0, float(np.abs(found).max()))))
     doubt = ", ambiguous: check it, or name it with --up" if up.ambiguous else ""
-    sign = "-" if up.up[axis] < 0 else ""
-    R = rotation_to_z(up.up)
+    axis_fact = ("up axis", f"{axis_name(found)}, tilted by {tilt:.1f} degrees{doubt}")
+    return [*facts, axis_fact, *_scene_facts(xyz, rotation_to_z(up.up), start, spacing)]
+
+
+def _scene_facts(xyz: F32, R: F64, start: F64, spacing: float) -> Facts:
+    """Facts of the surfaces of points (N, 3), metres, by their rotation (3, 3) to a level world."""
+    from scan2sim.pipeline.robot_maps.describe import describe
+
     found = describe(xyz @ R.T.astype(np.float32), R @ start)
     return [
-        *facts,
-        ("up axis", f"{sign}{'xyz'[axis]}, tilted by {tilt:.1f} degrees{doubt}"),
         ("spacing", f"{100 * spacing:.1f} cm between neighbouring points"),
         ("noise", f"{100 * found.noise:.1f} cm around planes"),
         ("surfaces", f"{found.level_share:.0%} level (ground, floors), {found.upright_share:.0%} upright (walls)"),
@@ -102,11 +122,12 @@ def folder_of_clouds(folder: Path) -> tuple[str, Facts]:
 
 def mesh_facts(path: Path) -> Facts:
     """Facts of points sampled from a mesh."""
-    from scan2sim.pipeline.importers.mesh_model import surface_points
+    from scan2sim.pipeline.importers.mesh_model import is_gltf, surface_points, usual_rotation
     from scan2sim.pipeline.io.mesh_models import read
 
     source, notes = read(path)
-    facts = map_facts(surface_points(source.mesh), MESH_POINTS)
-    if path.suffix.lower() in (".glb", ".gltf"):
+    cloud = surface_points(source.mesh)
+    facts = map_facts(cloud, MESH_POINTS, usual_rotation(path), "m" if is_gltf(path) else "")
+    if is_gltf(path):
         facts = [fact for fact in facts if fact[0] != "units"]
     return [*(("warning", note) for note in notes), *(f for f in facts if f[0] not in ("outliers", "spacing", "noise"))]

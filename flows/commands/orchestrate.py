@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 app = App(
     "Deploy services on edge and cloud through Open Source MANO (OSM).",
-    requirement=("orchestration", "httpx", "yaml", "jsonschema"),
+    requirement=("orchestration", "httpx", "jsonschema"),
 )
 
 Vim = Annotated[str, typer.Option("--vim", help="Name or id of the VIM account to run it on; give this or --cluster.")]

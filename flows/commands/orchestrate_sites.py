@@ -20,7 +20,7 @@ from scan2sim.services.orchestration.settings import Connection, OperationParams
 if TYPE_CHECKING:
     from scan2sim.services.orchestration.records import SiteRecord
 
-REQUIREMENT = ("orchestration", "httpx", "yaml", "jsonschema")
+REQUIREMENT = ("orchestration", "httpx", "jsonschema")
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name in OSM.")]
 
 vim = App("VIM accounts: clouds on which OSM starts virtual machines.", requirement=REQUIREMENT)

@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from scan2sim.flows.commands.app import App, Config, Sets, TilePath, settings_of
-from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.commands.display import console, progress, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.run_with_progress import plan_and_run, show_warnings
 from scan2sim.flows.engine.lock import locked
@@ -193,8 +193,8 @@ def short_names(files: Sequence[str]) -> list[str]:
 
 
 def _write_label_images(views: Path, probabilities: Path, out: Path) -> None:
-    """Write label images (LAS code of each pixel) and masks: 0 on vehicles, people and the sky, 255 elsewhere."""
-    masked = np.isin(np.arange(len(CLASSES)), [CLASSES.index(name) for name in ("vehicle", "person", "sky")])
+    """Write label images (LAS codes, 255 for none) and masks: 0 on vehicles, people and the sky, 255 elsewhere."""
+    masked = np.isin(np.arange(256), [CLASSES.index(name) for name in ("vehicle", "person", "sky")])
     photos = views_io.load(views)
     files = [one.name if Path(one.name).suffix.lower() in image.SUFFIXES else f"{one.name}.png" for one in photos]
     names = [f"{name}.png" for name in short_names(files)]
@@ -259,8 +259,10 @@ def _pixel_iou(folder: Path, settings: Settings) -> dict[str, float]:
         labelled = truth != IGNORED
         known.append(truth[labelled])
         predicted.append(best[labelled])
+    for warning in classifier.warnings():
+        warn(warning)
     codes = code_of_index()
-    codes[CLASSES.index("sky")] = 255  # not 0, which means unknown
+    codes[[CLASSES.index("sky"), IGNORED]] = 255, 0  # 0 means unknown
     found = confusion(codes[np.concatenate(known)], codes[np.concatenate(predicted)]).iou
     return {("sky" if name == "255" else name): value for name, value in found.items()}
 

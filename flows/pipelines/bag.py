@@ -32,7 +32,13 @@ class BagSource(PoseSourceParams, PhotoPlacementParams, SelectionParams, BagPara
         "times if the points have them, else none.",
     )
     intrinsics: Path | None = Field(
-        None, description="TOML file with the cameras, as in a tile, instead of CameraInfo."
+        None,
+        description="File with the cameras instead of CameraInfo: TOML as in a tile, or the calibration of another "
+        "program (docs/inputs.md).",
+    )
+    mask: Path | None = Field(
+        None,
+        description="Ego-vehicle mask: an image, 0 on the car; for several cameras a folder of them (front.png).",
     )
     urdf: Path | None = Field(
         None, description="URDF file of the robot: its fixed joints are added to the static transforms of the bag."
@@ -72,7 +78,11 @@ def build_graph(source: BagSource, here: Path) -> list[Task]:
     read = tasks[0].id
     files = {"sweeps": Output(read, "sweeps")}
     poses = None if plan.poses.kind == "sweeps" else Output(read, "poses")
-    photos = {"photos": Output(read, "photos")} if plan.cameras else {}
+    photos: dict[str, Path | Output] = {"photos": Output(read, "photos")} if plan.cameras else {}
+    if source.mask is not None:
+        if not photos:
+            raise SettingError("--mask", f"no photos of {path} are imported", "Leave it out, or choose a --camera")
+        photos["mask"] = here / source.mask
     if not (source.lidar_odometry or plan.gps or poses is None):
         return [*tasks, *sweeps.checked(files, photos, poses, placing, source.pose_source)]
     gps = Output(read, "gps") if plan.gps else None

@@ -95,5 +95,7 @@ def build_graph(drive: Drive, here: Path) -> list[Task]:
 
 def _at(given: video.Video, here: Path) -> video.Video:
     """The parameters with their paths resolved relative to `here`."""
-    files = {name: here / value for name, value in given if isinstance(value, Path)}
+    files: dict[str, Any] = {name: here / value for name, value in given if isinstance(value, Path)}
+    if given.camera_file is not None:
+        files["camera"] = str(here / given.camera_file)
     return video.Video.model_validate(given.model_dump(exclude_unset=True) | files)

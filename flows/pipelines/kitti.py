@@ -94,6 +94,7 @@ def import_kitti_odometry(
     trajectory_check: Path | None = None,
     max_range: float = 50.0,
     vertical_angle_offset: float = 0.0,
+    labels: Path | None = None,
     link: bool = False,
     overwrite: bool = False,
     name: str | None = None,
@@ -107,6 +108,7 @@ def import_kitti_odometry(
         poses: poses of camera 0, row-major 3x4, one per line; default: `poses.txt` in the sequence, or the data set's
             `../../poses/<sequence>.txt`.
         trajectory_check: result of the task `odometry_check`, if it was run already.
+        labels: folder of labels (`NNNNNN.label`) of SemanticKITTI, or predicted in its format: the points' classes.
         out, cameras, frames, pose_source, max_range, vertical_angle_offset, link, overwrite, name, warn, report: as in
             `import_kitti_raw`.
 
@@ -116,7 +118,11 @@ def import_kitti_odometry(
     Raises:
         ScanError: as `import_kitti_raw`.
     """
-    found = read_sequence(sequence, poses=poses, cameras=cameras, frames=frames, name=name)
+    found = read_sequence(sequence, poses=poses, cameras=cameras, frames=frames, name=name, labels=labels)
+    if labels is None and (sequence / "labels").is_dir():
+        warn(f"{sequence / 'labels'}: labels of SemanticKITTI aren't used; --labels {sequence / 'labels'} uses them")
+    if labels and (unlabelled := set(found.sweeps) - set(found.labels)):
+        warn(f"{labels}: no labels of {len(unlabelled)} sweeps, such as {min(unlabelled)}: their points have no class")
     offset = vertical_angle_offset
     check = partial(odometry_check, sequence, poses=poses, vertical_angle_offset=offset, frames=frames)
     task = None if pose_source == "given" else check(pose_source)

@@ -12,6 +12,7 @@ from scan2sim.flows.pipelines.graph import Output, Task, TaskId, folder_inputs
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.parameters import Shift
 from scan2sim.pipeline.core.step import Params, Step
+from scan2sim.pipeline.io import camera_calibrations
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.steps.import_sweeps import IMPORT_SWEEPS, SweepsParams
@@ -40,7 +41,8 @@ class Sweeps(PoseSourceParams, SweepsParams):
     )
     extrinsics: Path | None = Field(
         None,
-        description="File of the matrix T_camera_scanner (3 or 4 rows, or KITTI's), if the poses are the camera's.",
+        description="File of T_camera_scanner, if the poses are the camera's or there are photos: a matrix of 3 or 4 "
+        "rows, KITTI's, or the calibration of another program (docs/inputs.md).",
     )
     times: Path | None = Field(
         None,
@@ -54,8 +56,8 @@ class Sweeps(PoseSourceParams, SweepsParams):
 
     @property
     def camera_file(self) -> Path | None:
-        """TOML file of the photos' camera, if `camera` names a file and not a camera model."""
-        return Path(self.camera) if self.camera.endswith(".toml") or Path(self.camera).is_file() else None
+        """File of the photos' camera, if `camera` names a file and not a camera model."""
+        return camera_calibrations.file_of(self.camera)
 
     def inputs(self, here: Path) -> dict[str, Path]:
         """Input files of the import; paths are relative to `here`."""

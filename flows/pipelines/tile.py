@@ -61,6 +61,8 @@ from scan2sim.pipeline.steps.views import VIEWS
 from scan2sim.pipeline.steps.visibility import VISIBILITY
 from scan2sim.pipeline.steps.voxel import VOXEL
 from scan2sim.pipeline.steps.walls import WALLS
+from scan2sim.segmentation.huggingface import network_files
+from scan2sim.segmentation.label_images import LabelImages
 from scan2sim.segmentation.steps.instances import INSTANCES
 from scan2sim.segmentation.steps.label import LABEL
 from scan2sim.segmentation.steps.segment import SEGMENT
@@ -219,7 +221,7 @@ def _classify(graph: TileGraph) -> Scan:
     moving: Sources = {"moving": output(DYNAMIC_OBJECTS, "moving")}
     labels: Sources = {}
     if ground_views:
-        add(LABEL, cloud | views | _weights_input(graph.settings), **_segment_settings(graph.settings))
+        add(LABEL, cloud | views | _label_files(graph.settings, tile), **_segment_settings(graph.settings))
         labels = {"labels": output(LABEL, "labels")}
     add(SEGMENT, cloud | path | (poses | moving | labels if ground_views else {}), **_spacing(tile))
     return Scan(bool(ground_views), path, rays, views, poses, moving, sweeps, labels)
@@ -789,10 +791,14 @@ def check_here(settings: Settings) -> None:
             step.check(settings.params(step))
 
 
-def _weights_input(settings: Settings) -> dict[str, Path | Output]:
-    """The user's weights file as an input, so that other weights change the cache key."""
-    weights = settings.params(LABEL).weights
-    return {"weights": weights} if weights and weights.is_file() else {}
+def _label_files(settings: Settings, tile: Tile) -> dict[str, Path | Output]:
+    """The user's label images, or weights and what a network reads beside them, as inputs: part of the cache key."""
+    given = settings.params(LABEL)
+    if given.images is not None:
+        images = LabelImages(given.images, tile.views)
+        files = [*images.files.values(), *([images.names] if images.names.is_file() else [])]
+        return {f"image.{i}": file for i, file in enumerate(files)}
+    return {f"weights.{i}": file for i, file in enumerate(network_files(given.weights) if given.weights else ())}
 
 
 def _segment_settings(settings: Settings) -> dict[str, Any]:

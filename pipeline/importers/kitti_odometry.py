@@ -35,6 +35,7 @@ def read_sequence(
     cameras: Sequence[str] = ("image_2",),
     frames: tuple[int, int] | None = None,
     name: str | None = None,
+    labels: Path | None = None,
 ) -> Drive:
     """Files, calibration and poses of a sequence; arguments as of `flows.pipelines.kitti.import_kitti_odometry`.
 
@@ -58,6 +59,7 @@ def read_sequence(
         np.repeat(times[:, None], 3, axis=1),
         T_first @ T_cam0 @ T_cam0_velo,
         "local",
+        files_by_frame(labels, ".label") if labels else {},
     )
 
 

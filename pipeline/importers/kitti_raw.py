@@ -14,7 +14,7 @@ up to 20 ms later than the sweep of the same number, so poses are interpolated t
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -31,7 +31,7 @@ from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.calibration import read_entry
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.images.image import SUFFIXES
-from scan2sim.pipeline.io.sweep_files import Sweep, read_bin
+from scan2sim.pipeline.io.sweep_files import Sweep, read_bin, read_labels
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 # box that contains the recording car's own returns, scanner axes: (low, high) corner in metres
@@ -61,6 +61,7 @@ class Drive:
         spans: (F, 3) start, middle (scanner points forward) and end of each sweep, seconds.
         T_velo: (F, 4, 4) scanner to CRS at each sweep's middle.
         crs: code, or "local".
+        labels: files of labels of the sweeps' points by frame number (`sweep_files.read_labels`).
     """
 
     name: str
@@ -70,6 +71,7 @@ class Drive:
     spans: F64
     T_velo: F64
     crs: str
+    labels: dict[int, Path] = field(default_factory=dict)
 
 
 def read_drive(
@@ -143,7 +145,7 @@ def write_drive_tile(
     def placed() -> Iterator[PlacedPoints]:
         for i, (number, (start, _, end)) in enumerate(zip(numbers, drive.spans, strict=True)):
             report(PLACED * i / len(numbers), f"sweep {number}")
-            sweep = read_drive_sweep(drive.sweeps[number], max_range, vertical_angle_offset)
+            sweep = read_drive_sweep(drive.sweeps[number], max_range, vertical_angle_offset, drive.labels.get(number))
             beside = [(own[number], None) for own in views.values() if number in own]
             yield place(sweep, point_times(sweep, start, end, deskew), path, beside, remedy=SAME_DAY)
 
@@ -343,12 +345,21 @@ def point_times(sweep: Sweep, start: float, end: float, deskew: bool) -> F64:
     return start + phase * (end - start)
 
 
-def read_drive_sweep(path: Path, max_range: float, vertical_angle_offset: float = 0.0) -> Sweep:
-    """A sweep without returns from the car and beyond `max_range`; its beams raised by the offset, degrees."""
+def read_drive_sweep(
+    path: Path, max_range: float, vertical_angle_offset: float = 0.0, labels: Path | None = None
+) -> Sweep:
+    """A sweep without returns from the car and beyond `max_range`; its beams raised by the offset, degrees.
+
+    With the classes of its `labels`, if there are some.
+    """
     xyz, reflectance = read_bin(path)
     low, high = np.array(EGO_VEHICLE_BOX, np.float32)
     # float32, unlike `read_sweep`: a reflectance of 0.3 or 0.9 is rounded to the level next to that of float64
-    sweep = Sweep(raise_beams(xyz, vertical_angle_offset), np.round(reflectance * 65535).astype(np.uint16))
+    sweep = Sweep(
+        raise_beams(xyz, vertical_angle_offset),
+        np.round(reflectance * 65535).astype(np.uint16),
+        classification=read_labels(labels, len(xyz)) if labels else None,
+    )
     return sweep.take(~((xyz > low) & (xyz < high)).all(axis=1)).between(0.0, max_range)
 
 

@@ -82,8 +82,8 @@ def import_mesh(
     source, notes = read(path)
     for note in notes:
         warn(note)
-    is_gltf, guessed = path.suffix.lower() in (".glb", ".gltf"), params.units == "auto"
-    if is_gltf and params.units == "auto":
+    guessed = params.units == "auto"
+    if guessed and is_gltf(path):
         params = params.model_copy(update={"units": "m"})
     some = surface_points(source.mesh).xyz
     unit = unit_of(some, exact_point_spacing(some), params, warn)
@@ -96,7 +96,7 @@ def import_mesh(
     report(0.4, "up axis")
     face, weights = sample(mesh, int(np.clip(area / SPACING_M**2, *POINTS)))
     points = _positions(mesh, face, weights)
-    R = _rotation(points, params, origin, is_gltf, warn)
+    R = _rotation(points, params, origin, usual_rotation(path), warn)
     x, y, z = (R @ origin).tolist()
     frame = Frame(origin=(x, y, z))
     mesh = replace(mesh, frame=frame, vertices=mesh.vertices @ R.T.astype(np.float32))
@@ -145,12 +145,19 @@ def _positions(mesh: Mesh, face: I32, weights: F32) -> F32:
     return np.asarray(a + weights[:, :1] * (b - a) + weights[:, 1:] * (c - a), np.float32)
 
 
-def _rotation(points: F32, params: MapParams, origin: F64, is_gltf: bool, warn: Callable[[str], None]) -> F64:
+def is_gltf(path: Path) -> bool:
+    """Whether a mesh is glTF, by its suffix: in metres and y up by its specification."""
+    return path.suffix.lower() in (".glb", ".gltf")
+
+
+def usual_rotation(path: Path) -> F64:
+    """(3, 3) rotation to z up by the specification of a mesh's format; surfaces may prove otherwise."""
+    return rotation_to_z(np.array(AXES["y" if is_gltf(path) else "z"], np.float64))
+
+
+def _rotation(points: F32, params: MapParams, origin: F64, usual: F64, warn: Callable[[str], None]) -> F64:
     """(3, 3) rotation to a level world; exactly along an axis of the mesh if it is closer than `MIN_TILT_DEG`."""
-    coarse = np.eye(3)
-    if is_gltf and params.up == "auto":  # y is up by the specification; surfaces may prove otherwise
-        coarse = rotation_to_z(np.array(AXES["y"], np.float64))
-    R = level_rotation(points @ coarse.T.astype(np.float32), params, coarse @ origin, warn) @ coarse
+    R = level_rotation(points, params, origin, warn, usual)
     up = np.zeros(3)
     axis = int(np.abs(R[2]).argmax())
     up[axis] = np.sign(R[2, axis])

@@ -39,6 +39,7 @@ class PlacedPoints:
         time: (N,) seconds at which it was measured.
         intensity: (N,) 0 if unknown.
         distance: (N,) metres from the scanner.
+        classification: (N,) class codes; 0 if unknown.
     """
 
     xyz: F32
@@ -47,6 +48,7 @@ class PlacedPoints:
     time: F64
     intensity: npt.NDArray[np.uint16]
     distance: F32
+    classification: U8
 
 
 def place(
@@ -77,7 +79,8 @@ def place(
         for view, mask in views:
             colour_from_photo(world, view, rgb, seen, mask=mask, remedy=remedy)
     distance = np.linalg.norm(sweep.xyz, axis=1).astype(np.float32)
-    return PlacedPoints(world.astype(np.float32), rgb, seen, times, sweep.intensity, distance)
+    classes = np.zeros(len(world), np.uint8) if sweep.classification is None else sweep.classification
+    return PlacedPoints(world.astype(np.float32), rgb, seen, times, sweep.intensity, distance, classes)
 
 
 def merge(parts: Iterable[PlacedPoints], voxel: float | None = None) -> Iterator[PlacedPoints]:
@@ -175,7 +178,8 @@ def write_placed(
 def _write_cloud(path: Path, points: PlacedPoints, frame: Frame) -> None:
     rgb = fill_colours(points.xyz, points.rgb, points.seen, points.distance) if points.seen.any() else None
     intensity = points.intensity if points.intensity.any() else None
-    las.write(path, PointCloud(frame, points.xyz, rgb, time=points.time, intensity=intensity))
+    classes = points.classification if points.classification.any() else None
+    las.write(path, PointCloud(frame, points.xyz, rgb, classification=classes, time=points.time, intensity=intensity))
 
 
 def _photo_entries(views: Mapping[str, Sequence[View]], frame: Frame, work: Path, link: bool) -> list[dict[str, Any]]:

@@ -37,7 +37,7 @@ from scan2sim.pipeline.robot_maps.label_colours import (
 )
 from scan2sim.pipeline.robot_maps.outliers import below_floor, far_outliers
 
-VERSION = 7
+VERSION = 8
 """Version of the importer: raised when the same input and options give another tile."""
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}
 MIN_TILT_DEG = 0.5
@@ -50,6 +50,7 @@ USUAL_HEIGHT_M = 100.0
 """Height of a map or mesh above which its assumed unit is doubted: centimetres look like that."""
 FAR_ORIGIN_M = 10_000.0
 """Coordinates above this need an origin of their own to fit into float32."""
+SURVEYED = "the coordinates are those of a survey, more than 10 km from their origin"
 AXES: dict[str, tuple[int, int, int]] = {
     "x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1), "-z": (0, 0, -1),
 }  # fmt: skip
@@ -285,7 +286,9 @@ def _without(cloud: PointCloud, bad: Bools, what: str, warn: Callable[[str], Non
     return cloud.take(~bad)
 
 
-def level_rotation(xyz: F32, params: MapParams, origin: F64, warn: Callable[[str], None]) -> F64:
+def level_rotation(
+    xyz: F32, params: MapParams, origin: F64, warn: Callable[[str], None], usual: F64 | None = None
+) -> F64:
     """(3, 3) rotation from a map's axes to a level world.
 
     Args:
@@ -293,12 +296,18 @@ def level_rotation(xyz: F32, params: MapParams, origin: F64, warn: Callable[[str
         params: settings.
         origin: (3,) metres.
         warn: receives the tilt, and whether it is ambiguous.
+        usual: (3, 3) rotation to z up by the format's specification, from which only surfaces lead away; None: z is up.
     """
-    coarse = np.eye(3) if params.up == "auto" else rotation_to_z(np.array(AXES[params.up], np.float64))
+    coarse = np.eye(3) if usual is None else usual
+    if params.up != "auto":
+        coarse = rotation_to_z(np.array(AXES[params.up], np.float64))
+    elif is_surveyed(coarse @ origin):
+        warn(f"{axis_name(coarse[2])} is up: {SURVEYED}")
+        return coarse
     found = find_up(xyz @ coarse.T.astype(np.float32), -(coarse @ origin))
     if found is None:
         if params.up == "auto":
-            warn("no flat surfaces: z is assumed to point up; --up names another axis")
+            warn(f"no flat surfaces: {axis_name(coarse[2])} is assumed to point up; --up names another axis")
         return coarse
     if params.up != "auto" and found.up[2] < np.cos(np.radians(45)):
         return coarse  # the user knows better
@@ -310,11 +319,17 @@ def level_rotation(xyz: F32, params: MapParams, origin: F64, warn: Callable[[str
     tilt = np.degrees(np.arccos(np.clip(nearest[2] @ found.up, -1, 1)))
     if tilt < MIN_TILT_DEG or (not found.has_walls and tilt < MAX_SLOPE_DEG):
         if not np.array_equal(nearest, np.eye(3)):
-            warn(f"up is the map's {_axis_name(nearest[2])} axis")
+            warn(f"up is the map's {axis_name((nearest @ coarse)[2])} axis")
         return nearest @ coarse
     R = rotation_to_z(found.up) @ coarse
     warn(_tilt_text(found, R))
     return R
+
+
+def is_surveyed(origin: F64) -> bool:
+    """Whether a map at `origin` (3,), metres, has the eastings, northings and heights of a survey: z is up."""
+    far = np.abs(origin) > FAR_ORIGIN_M
+    return bool(far[:2].all() and not far[2])
 
 
 def _nearest_axis(up: F64) -> F64:
@@ -325,7 +340,8 @@ def _nearest_axis(up: F64) -> F64:
     return axis
 
 
-def _axis_name(up: F64) -> str:
+def axis_name(up: F64) -> str:
+    """Signed axis of a map that is nearest to a direction (3,): "z", "-y"."""
     largest = int(np.abs(up).argmax())
     return f"{'-' if up[largest] < 0 else ''}{'xyz'[largest]}"
 
@@ -334,7 +350,7 @@ def _tilt_text(found: Upright, R: F64) -> str:
     up = R[2]  # the world's z axis in the map's axes
     tilt = np.degrees(np.arccos(np.clip(np.abs(up).max(), -1, 1)))
     by = "walls" if found.has_walls else "ground"
-    return f"up is the map's {_axis_name(up)} axis, tilted by {tilt:.1f} degrees (from its {by}): levelled"
+    return f"up is the map's {axis_name(up)} axis, tilted by {tilt:.1f} degrees (from its {by}): levelled"
 
 
 def _add_trajectory(source: Path, out: Path, T_world_map: F64, unit: float) -> None:

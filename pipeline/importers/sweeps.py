@@ -31,7 +31,7 @@ from scan2sim.pipeline.io.sweep_files import SWEEP_SUFFIXES, Sweep, list_files, 
 from scan2sim.pipeline.io.trajectory import QUATERNIONS_HELP, QuaternionOrder
 from scan2sim.pipeline.pose_check.conventions import AXES, CameraAxes
 
-VERSION = 2
+VERSION = 3
 """Version of the importer: raised when the same input and options give another tile."""
 MAX_PHOTO_DISTANCE_M = 2.0
 """Distance between a sweep and the photo that colours it, so that their views of the scene hardly differ."""
@@ -253,6 +253,8 @@ def tilt_warning(path: Trajectory, T_camera_scanner: F64, placing: PlacementPara
     up = mean_up(path.poses @ mount)
     if up >= MIN_UP:
         return None
+    if not placing.scanner_poses and mean_up(path.poses) > MIN_UPRIGHT:
+        return "the poses look like the scanner's: with `--scanner-poses` its z axis points upwards"
     if not placing.scanner_poses and mean_up(path.poses @ np.linalg.inv(mount)) > MIN_UPRIGHT:
         option = "without" if placing.invert_extrinsics else "with"
         return f"extrinsics look inverted: {option} `--invert-extrinsics` the scanner's z axis points upwards"

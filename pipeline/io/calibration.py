@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +13,18 @@ from scan2sim.pipeline.camera import panorama
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.poses import nearest_rotation
 from scan2sim.pipeline.core.types import F64, Camera
-from scan2sim.pipeline.io import file_checks, toml
+from scan2sim.pipeline.io import camera_calibrations, file_checks, toml
+from scan2sim.pipeline.io.camera_calibrations import CalibratedCamera
 from scan2sim.pipeline.io.images.image import SUFFIXES, read_levels, size_of
 from scan2sim.pipeline.io.sweep_files import list_files
-from scan2sim.pipeline.io.tile import DISTORTION_LENGTHS, CameraEntry
+from scan2sim.pipeline.io.tile import CameraEntry, camera_entry, camera_of
 
+CAMERAS_REMEDY = (
+    "Write [[cameras]] with id, model, size, focal, centre as in a tile.toml (docs/reference/formats.md), or give the "
+    "file of Kalibr, ROS, OpenCV or direct_visual_lidar_calibration (.yaml, .json, .xml)"
+)
+MAX_LEVER_ARM_M = 20.0
+"""Largest distance of a camera from the scanner of a vehicle; calibrations in millimetres exceed it."""
 MAX_VALUE = 1e8
 """Plausibility limit of calibration values."""
 
@@ -25,12 +32,15 @@ MAX_VALUE = 1e8
 def read_extrinsics(path: Path) -> F64:
     """Read T_camera_scanner (4, 4) from a text file: three or four rows of four numbers, or a calibration of KITTI.
 
-    Supported KITTI files: `calib_velo_to_cam.txt` (R: and T:), and `calib.txt` of the odometry data set (Tr:).
+    Supported KITTI files: `calib_velo_to_cam.txt` (R: and T:), and `calib.txt` of the odometry data set (Tr:). Files
+    with the suffix of YAML, JSON or XML are calibrations of other programs (`camera_calibrations`).
 
     Raises:
         InputError: another format, or not a rigid transform.
     """
     remedy = "Write T_camera_scanner: three rows of four numbers, scanner axes to camera axes"
+    if is_foreign(path):
+        return _rigid(path, camera_calibrations.read_extrinsics(path), remedy)
     lines = [line.partition("#")[0].strip() for line in file_checks.lines(path)]
     entries = _entries(lines)
     try:
@@ -44,9 +54,27 @@ def read_extrinsics(path: Path) -> F64:
                 raise ValueError(f"{len(rows)} rows")
     except ValueError as error:
         raise InputError(path, f"contains no 3x4 or 4x4 matrix ({error})", remedy) from None
+    return _rigid(path, rows, remedy)
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether a file is a calibration of another program, by its suffix."""
+    return path.suffix.lower() in camera_calibrations.SUFFIXES
+
+
+def _rigid(path: Path, rows: F64, remedy: str) -> F64:
+    """A rigid transform (4, 4) of rows (3 or 4, 4), with an exact rotation.
+
+    Raises:
+        InputError: it isn't rigid, or the translation can't be in metres.
+    """
     R = rows[:3, :3]
     if not np.isfinite(rows).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
         raise InputError(path, "its left 3x3 is not a rotation matrix", remedy)
+    distance = float(np.linalg.norm(rows[:3, 3]))
+    if distance > MAX_LEVER_ARM_M:
+        cause = f"puts the camera {distance:,.0f} m from the scanner"
+        raise InputError(path, cause, "Give the translation in metres (it may be in millimetres)")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = nearest_rotation(R), rows[:3, 3]
     return T
@@ -80,32 +108,68 @@ def photo_extrinsics(path: Path, photos: Path) -> F64 | None:
     return T
 
 
-def read_camera(path: Path, width: int, height: int) -> Camera:
-    """The camera for photos of a size, from the `[[cameras]]` of a tile.toml, or of a file with only these.
+def read_camera(path: Path, width: int, height: int, *, names: Sequence[str] = (), rectified: bool = False) -> Camera:
+    """The camera for photos of a size, from `[[cameras]]` of a TOML file or tile, or another program's calibration.
+
+    Args:
+        path: the file (`camera_calibrations` lists the other programs), or the folder of a tile.
+        width, height: size of the photos, pixels.
+        names: what the photos' camera may be called in the file (an id, a topic), which decides between several.
+        rectified: the photos are rectified: of ROS, the intrinsics of P count.
 
     Raises:
-        InputError: no camera of that size, or it is invalid.
+        InputError: no camera of that size, or several that differ, or it is invalid.
     """
     path = path / "tile.toml" if path.is_dir() else path
-    remedy = "Write [[cameras]] with id, model, size, focal, centre as in a tile.toml (docs/reference/formats.md)"
+    found = camera_calibrations.read_cameras(path, (width, height)) if is_foreign(path) else _cameras(path)
+    fitting = [one for one in found if (one.camera.width, one.camera.height) == (width, height)]
+    if not fitting:
+        raise _no_camera_of_size(path, found, width, height)
+    named = [one for one in fitting if not set(names).isdisjoint(one.names)] or fitting
+    if len({one.camera for one in named}) > 1:
+        cause = f"has several cameras of {width}x{height} ({', '.join(one.names[0] for one in named)})"
+        wanted = f"Give the right one the id {' or '.join(filter(None, names))}" if any(names) else "Remove the others"
+        raise InputError(path, cause, f"{wanted}, or give a file with one camera")
+    raw = named[0].camera
+    chosen = (named[0].rectified or (None if raw.distortion else raw)) if rectified else raw
+    if chosen is None:
+        raise InputError(
+            path, "has the camera of raw images, but those of the bag are rectified",
+            "Choose the topic of the raw images with --camera, or write the pinhole camera of P as [[cameras]]",
+        )  # fmt: skip
+    return camera_of(path, CameraEntry.model_validate(camera_entry(named[0].names[0], chosen)))  # checks its numbers
+
+
+def _no_camera_of_size(path: Path, found: Sequence[CalibratedCamera], width: int, height: int) -> InputError:
+    """The error of `read_camera`: the sizes that there are, and what to write if the photos were scaled."""
+    sizes = ", ".join(f"{one.camera.width}x{one.camera.height}" for one in found) or "none"
+    remedy = CAMERAS_REMEDY
+    scaled = [one.camera for one in found if one.camera.width * height == one.camera.height * width]
+    if scaled and scaled[0].fx > 0:
+        c = scaled[0].resized(width, height)
+        remedy = (
+            "If the photos are scaled, not cropped, write a TOML file: [[cameras]] with "
+            f"focal = [{c.fx:.3f}, {c.fy:.3f}], centre = [{c.cx:.3f}, {c.cy:.3f}], the same model and distortion"
+        )
+    return InputError(path, f"has no camera of {width}x{height} (it has {sizes})", remedy)
+
+
+def _cameras(path: Path) -> list[CalibratedCamera]:
+    """Cameras of a TOML file.
+
+    Raises:
+        InputError: one is invalid.
+    """
     try:
-        cameras = [CameraEntry.model_validate(entry) for entry in toml.table(path).get("cameras", [])]
+        entries = [CameraEntry.model_validate(entry) for entry in toml.table(path).get("cameras", [])]
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise InputError(path, f"field `cameras.{where}`: {first['msg']}", remedy) from None
+        raise InputError(path, f"field `cameras.{where}`: {first['msg']}", CAMERAS_REMEDY) from None
     except TypeError:
-        raise InputError(path, "its `cameras` are not tables", remedy) from None
-    for c in cameras:
-        if c.size == (width, height):
-            if c.model != "equirectangular" and not min(c.focal) > 0:
-                raise InputError(path, f"camera `{c.id}`: focal {c.focal} is not positive", remedy)
-            if len(c.distortion) not in DISTORTION_LENGTHS[c.model]:
-                lengths = " or ".join(map(str, DISTORTION_LENGTHS[c.model]))
-                raise InputError(path, f"camera `{c.id}`: {len(c.distortion)} coefficients, expected {lengths}", remedy)
-            return Camera(c.model, *c.size, *c.focal, *c.centre, c.distortion)
-    found = ", ".join(f"{c.size[0]}x{c.size[1]}" for c in cameras) or "none"
-    raise InputError(path, f"has no camera of {width}x{height} (it has {found})", remedy)
+        raise InputError(path, "its `cameras` are not tables", CAMERAS_REMEDY) from None
+    cameras = [(entry.id, camera_of(path, entry)) for entry in entries]
+    return [CalibratedCamera((name,), camera, camera) for name, camera in cameras]
 
 
 def camera_of_photos(
@@ -126,14 +190,17 @@ def camera_of_photos(
         file: file with cameras.
 
     Raises:
-        InputError: no photos, or no focal length. SettingError: unknown model.
+        InputError: no photos, or no focal length. SettingError: unknown model, or a file and a number are given.
     """
     if model not in ("auto", "pinhole", "equirectangular"):
         raise SettingError("camera", f"unknown model {model!r}", "Use auto, pinhole, equirectangular, or a file")
     first = list_files(photos, SUFFIXES, "photos")[0]
     width, height = size_of(first)
     if file is not None:
-        return read_camera(file, width, height)
+        for name, given in (("focal", focal), ("centre", centre)):
+            if given is not None:
+                raise SettingError(f"--{name}", "is given beside a file with the camera", "Leave one of them out")
+        return read_camera(file, width, height, names=(photos.resolve().name,))
     if model == "auto" and focal is None and width == 2 * height:
         panorama.check(first, read_levels(first))
         model = "equirectangular"

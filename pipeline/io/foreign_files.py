@@ -16,10 +16,15 @@ _SCANNER = "Register and export it as E57 with the scanner's program"
 _SPLATS = "Give a point cloud or mesh of the scene: splats aren't points on surfaces"
 KNOWN: dict[tuple[str, ...], tuple[str, str]] = {
     (".usdz", ".usd", ".usda", ".usdc"): ("a USD scene", _MESH),
-    (".fbx", ".dae", ".stl", ".3ds", ".x3d", ".wrl", ".blend", ".3dm", ".skp", ".off"): ("a mesh or scene", _MESH),
+    (".fbx", ".dae", ".stl", ".3ds", ".x3d", ".wrl", ".blend", ".3dm", ".skp", ".off",
+     ".3mf", ".amf", ".ctm", ".zae", ".3dxml", ".xaml", ".msh"): ("a mesh or scene", _MESH),
     (".osgb", ".b3dm", ".i3s", ".slpk", ".3mx", ".3sm"): ("a tiled mesh", _MESH),
-    (".ifc", ".dwg", ".dxf", ".rvt"): ("a CAD or BIM model", "Export its surfaces as OBJ or GLB"),
-    (".ptg", ".pod", ".rcp", ".rcs", ".zlas", ".npy"): ("a cloud of another kind", _E57),
+    (".ifc", ".dwg", ".dxf", ".rvt", ".step", ".stp", ".iges", ".igs"): (
+        "a CAD or BIM model", "Export its surfaces as OBJ or GLB",
+    ),
+    (".ptg", ".pod", ".rcp", ".rcs", ".zlas", ".npy", ".bpf", ".drc", ".fbi", ".parquet", ".feather"): (
+        "a cloud of another kind", _E57,
+    ),
     (".bin",): (
         "a lidar sweep of KITTI, or a cloud of CloudCompare",
         "Import sweeps with scan2sim import sweeps; save a cloud of CloudCompare as E57 or LAZ",
@@ -43,7 +48,7 @@ KNOWN: dict[tuple[str, ...], tuple[str, str]] = {
     (".ubx", ".obs", ".rnx", ".nav", ".sbf", ".t02", ".t04", ".gpb"): ("raw GNSS data", _RAW),
     (".out", ".sbet", ".smrmsg", ".traj", ".pof", ".trj"): ("perhaps a damaged trajectory (SBET, POF)", _PATH),
     (".insv", ".insp"): ("a recording of Insta360", "Stitch and export it as MP4 or JPEG, with its GPS as GPX"),
-    (".zip", ".7z", ".rar", ".gz", ".tgz", ".tar"): ("an archive", "Unpack it first"),
+    (".zip", ".7z", ".rar", ".gz", ".tgz", ".tar", ".bz2", ".xz", ".zst"): ("an archive", "Unpack it first"),
 }  # fmt: skip
 """Kind of a file and the remedy, by suffixes in lower case."""
 

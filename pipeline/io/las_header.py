@@ -107,6 +107,11 @@ def _check_chunk_table(path: Path, file: BinaryIO, start: int, size: int, count:
     import lazrs
 
     chunk = struct.unpack_from("<I", laszip.ljust(16, b"\0"), 12)[0]
+    if laszip and not chunk:
+        cause = "was compressed by LASzip 1, before 2011, whose points aren't in chunks"
+        raise InputError(
+            path, cause, "Write it again with a current LASzip, or as LAS: `las2las -i OLD.laz -o NEW.las`"
+        )
     if not chunk:
         raise _unreadable(path, "it has no laszip record, which describes how points are compressed")
     file.seek(start)

@@ -10,7 +10,7 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -18,7 +18,7 @@ from trimesh.resolvers import Resolver
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, F64, I64, U8, UNCOLOURED, Bools, Frame, Mesh
-from scan2sim.pipeline.io import file_checks, foreign_files, gltf_features
+from scan2sim.pipeline.io import file_checks, foreign_files, gltf_features, obj_faces
 from scan2sim.pipeline.io.images.image import MAX_PIXELS
 from scan2sim.pipeline.io.mesh_files import SUFFIXES, find_beside, ply_textures
 from scan2sim.pipeline.io.source_mesh import SourceMesh, encoded
@@ -113,7 +113,7 @@ def _load(path: Path, folder: _Folder) -> trimesh.Scene:
     if path.suffix.lower() in (".gltf", ".glb"):
         gltf_features.check(path)
     try:
-        with open(path, "rb") as file:
+        with _opened(path) as file:
             return trimesh.load_scene(
                 file, file_type=path.suffix[1:].lower(), resolver=folder, process=False, skip_materials=False
             )
@@ -125,6 +125,13 @@ def _load(path: Path, folder: _Folder) -> trimesh.Scene:
         missing = f"; not found: {', '.join(folder.missing)}" if folder.missing else ""
         cause = f"can't be read as a mesh ({type(error).__name__}: {error}{missing})"
         raise InputError(path, cause, REMEDY) from None
+
+
+def _opened(path: Path) -> IO[Any]:
+    """The file; of an OBJ its text as trimesh reads it rightly."""
+    if path.suffix.lower() != ".obj":
+        return path.open("rb")
+    return io.StringIO(obj_faces.rewritten(trimesh.util.decode_text(path.read_bytes())))
 
 
 def _head(path: Path) -> bytes:
@@ -219,11 +226,15 @@ def _look(shape: trimesh.Trimesh) -> tuple[F32 | None, U8, Any]:
         return None, colour, None
     material: Any = visual.material
     image, tint = getattr(material, "image", None), None
+    if image is not None and _is_placeholder(image):
+        image = None
     if hasattr(material, "baseColorTexture"):
         image, tint = material.baseColorTexture, material.baseColorFactor
     elif image is None:
         tint = getattr(material, "kwargs", {}).get("kd")  # the factor of an image is often wrong in OBJ
     per_vertex = visual.vertex_attributes.get("color")
+    if per_vertex is None and image is None:
+        per_vertex = _own_colours(shape, tint is not None)
     uv = None if visual.uv is None or len(visual.uv) != len(shape.vertices) else np.asarray(visual.uv)[faces]
     if image is not None and uv is not None:
         colour[:] = 255
@@ -236,6 +247,18 @@ def _look(shape: trimesh.Trimesh) -> tuple[F32 | None, U8, Any]:
         own = np.clip(level, 0, 255)[faces][..., :3]
         colour = (own if image is None else own * (colour / 255.0)).astype(np.uint8)
     return (None if uv is None else uv.astype(np.float32)), colour, image if uv is not None else None
+
+
+def _is_placeholder(image: Any) -> bool:
+    """Whether an image is trimesh's own, of meshes with texture coordinates whose material or image is missing."""
+    own = trimesh.visual.material.color_image()
+    return bool(image.size == own.size and image.mode == own.mode and image.tobytes() == own.tobytes())
+
+
+def _own_colours(shape: trimesh.Trimesh, tinted: bool) -> Any:
+    """Colours of the vertices beside texture coordinates without an image; of a tinted mesh only if they vary."""
+    found = shape.vertex_attributes.get("color")
+    return None if found is None or (tinted and not np.ptp(np.asarray(found)[:, :3], axis=0).any()) else found
 
 
 def _merged(parts: list[_Part], path: Path, notes: list[str]) -> SourceMesh:

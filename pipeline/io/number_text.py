@@ -60,6 +60,8 @@ def numbers(lines: list[str], delimiter: str | None, width: int) -> F64:
     Raises:
         ValueError: a line contains something else, or a different number of values.
     """
+    if not lines:
+        return np.empty((0, width))
     values = np.loadtxt(lines, np.float64, delimiter=delimiter, comments=None, ndmin=2)
     if values.size and values.shape[1] != width:
         raise ValueError(f"a line has {values.shape[1]} numbers, not {width}")

@@ -111,7 +111,7 @@ class Summary:
         if part.classification is not None and (wrong := ~_are_codes(part.classification)).any():
             self.no_codes = self.no_codes[0] + int(wrong.sum()), float(part.classification[wrong][0])
         if part.time is not None:
-            self.timed |= bool(part.time.any())
+            self.timed |= bool(np.nan_to_num(part.time).any())
         for name in ("intensity", "classification", "time"):
             self.having[name] = self.having.get(name, 0) + (0 if getattr(part, name) is None else len(part))
         return part

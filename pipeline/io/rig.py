@@ -16,7 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Camera
-from scan2sim.pipeline.io import toml
+from scan2sim.pipeline.io import file_checks, toml
+from scan2sim.pipeline.io.images.image import SUFFIXES
 from scan2sim.pipeline.io.tile import CameraEntry, camera_entry, camera_of
 
 RIG = "rig.toml"
@@ -61,6 +62,31 @@ def read_rig(folder: Path) -> list[RigCamera]:
             raise InputError(path, f"the id {entry.id!r} is not the name of a folder", REMEDY)
         found.append(RigCamera(entry.id, camera_of(path, entry), T))
     return found
+
+
+def masks_of_rig(path: Path | None, ids: list[str]) -> dict[str, Path]:
+    """Ego-vehicle masks of a rig's cameras by id.
+
+    Args:
+        path: the mask of the only camera, or a folder of masks that are named by the cameras (front.png); None: none.
+        ids: the cameras.
+
+    Raises:
+        InputError: one mask for several cameras, or a mask of none of them.
+    """
+    if path is None:
+        return {}
+    cameras = ", ".join(ids)
+    if not path.is_dir():
+        if len(ids) > 1:
+            remedy = f"Give a folder of masks named by camera, such as {ids[0]}.png"
+            raise InputError(path, f"is one mask for several cameras ({cameras})", remedy)
+        return {ids[0]: path}
+    masks = {file.stem: file for file in file_checks.files(path) if file.suffix.lower() in SUFFIXES}
+    if not masks or not masks.keys() <= set(ids):
+        cause = f"has the masks {', '.join(masks) or 'none'}, but the cameras are {cameras}"
+        raise InputError(path, cause, f"Name each mask after its camera, such as {ids[0]}.png")
+    return masks
 
 
 def write_rig(folder: Path, cameras: Iterable[RigCamera]) -> Path:

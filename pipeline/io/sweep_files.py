@@ -17,6 +17,7 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, F64, U8, Bools, Frame, Trajectory
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import file_checks
+from scan2sim.pipeline.io.label_sets import SEMANTIC_KITTI
 from scan2sim.pipeline.io.point_chunks import to_uint16
 
 SWEEP_SUFFIXES = (".bin", ".pcd", ".ply", ".las", ".laz")
@@ -32,12 +33,16 @@ MIN_NANOSECONDS = 1e17
 
 
 class Sweep(NamedTuple):
-    """`xyz` (N, 3) in scanner axes, `intensity` (N,), 0 if unknown, `rgb` (N, 3) or None, `time` (N,) s or None."""
+    """`xyz` (N, 3) in scanner axes, `intensity` (N,), 0 if unknown, `rgb` (N, 3), `time` (N,) s, `classification` (N,).
+
+    The last three are None if the file doesn't have them.
+    """
 
     xyz: F32
     intensity: npt.NDArray[np.uint16]
     rgb: U8 | None = None
     time: F64 | None = None
+    classification: U8 | None = None
 
     def between(self, near: float, far: float) -> Sweep:
         """The points between `near` and `far` metres from the scanner."""
@@ -46,8 +51,8 @@ class Sweep(NamedTuple):
 
     def take(self, keep: Bools) -> Sweep:
         """The points selected by a mask (N,)."""
-        rgb = None if self.rgb is None else self.rgb[keep]
-        return Sweep(self.xyz[keep], self.intensity[keep], rgb, None if self.time is None else self.time[keep])
+        columns: Any = (None if column is None else column[keep] for column in self)
+        return Sweep(*columns)
 
 
 def list_files(folder: Path, suffixes: Sequence[str] = SWEEP_SUFFIXES, what: str = "sweeps") -> list[Path]:
@@ -118,6 +123,19 @@ def read_bin(path: Path) -> tuple[F32, F32]:
     if largest > 1:  # of 8 or 16 bits
         reflectance = reflectance / np.float32(255 if largest <= 255 else 65535)
     return data[:, :3], np.clip(reflectance, 0, 1)
+
+
+def read_labels(path: Path, points: int) -> U8:
+    """(N,) class codes of the points of a sweep in a `.label` of SemanticKITTI: 16 bits of class, 16 of instance.
+
+    Raises:
+        InputError: it has another number of labels than the sweep has points.
+    """
+    labels = np.fromfile(file_checks.check(path), "<u4")
+    if len(labels) != points or path.stat().st_size % 4:
+        cause = f"has {len(labels):,} labels for a sweep of {points:,} points"
+        raise InputError(path, cause, "Give the labels of these sweeps: a uint32 per point, by the same frame numbers")
+    return SEMANTIC_KITTI.codes(labels & 0xFFFF).astype(np.uint8)
 
 
 def reading(path: Path) -> str | None:

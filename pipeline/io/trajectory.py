@@ -45,6 +45,10 @@ GPS_REMEDY = "Project it to the clouds' CRS (time,x,y,z); `import sweeps` and `i
 KITTI_RATE_HZ = 10.0  # KITTI's cameras: 10 poses per second
 MAX_COORDINATE_M = 1e9
 """Plausibility limit: no position is farther from the origin of a CRS."""
+TEXT_SUFFIXES = (".csv", ".txt", ".asc", ".xyz")
+"""Suffixes of texts that may be a trajectory or a cloud."""
+HEAD_BYTES = 1 << 16
+"""Part of a text by which a trajectory is recognized."""
 QuaternionOrder = Literal["xyzw", "wxyz"]
 QUATERNIONS_HELP = "Order of the trajectory's quaternions: xyzw as documented, or wxyz."
 Lines = list[tuple[int, list[str]]]  # line number in the file, from 1 on, and cells
@@ -68,18 +72,8 @@ def read(
     frame = frame or Frame()
     if sbet.is_sbet(path):
         return sbet.read(path, frame)
-    kind, lines = _lines(path)
-    if kind == ".kitti":
-        if timed and times is None:
-            raise InputError(path, "has no times", REMEDIES[".csv"])
-        trajectory = _from_kitti(path, lines, frame, times)
-    else:
-        columns: tuple[str, ...] = POSITION_COLUMNS + QUATERNION_COLUMNS
-        if kind == ".csv":
-            columns, lines = _header_line(path, lines)
-        if {"time", "sec"} & set(columns):  # without times, repeated lines are those of a stationary vehicle
-            lines = [one for one, before in zip(lines, [(0, [""]), *lines], strict=False) if one[1] != before[1]]
-        trajectory = _from_columns(path, kind, columns, lines, frame, times, timed)
+    kind, lines = _lines(path, _text(path))
+    trajectory, lines = _from_lines(path, kind, lines, frame, times, timed)
     far = np.flatnonzero(~(np.abs(trajectory.positions) < MAX_COORDINATE_M).all(axis=1))
     if len(far):
         raise _bad(path, kind, lines[far[0]][0], "its position is out of range", "Remove lines without a pose")
@@ -91,6 +85,25 @@ def read(
             path, kind, number, "its time is not after that of the previous line", "Sort by time, without duplicates"
         )
     return trajectory if ordered else _select(trajectory, order)
+
+
+def is_trajectory(path: Path) -> bool:
+    """Whether a file is a trajectory by its suffix, or a text whose first lines are poses with rotations."""
+    suffix = path.suffix.lower()
+    if suffix in (".tum", ".kitti"):
+        return True
+    if suffix not in TEXT_SUFFIXES:
+        return False
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    text = head.decode("utf-8-sig", "replace")
+    if len(head) == HEAD_BYTES:
+        text = text.rpartition("\n")[0]
+    try:
+        found, _ = _from_lines(path, *_lines(path, text), Frame(), None, False)
+    except InputError:
+        return False
+    return found.rotations is not None
 
 
 def read_local(path: Path, crs: str, quaternions: QuaternionOrder = "xyzw") -> tuple[Trajectory, Frame]:
@@ -167,16 +180,19 @@ def _bad(path: Path, kind: str, line: int, cause: str, remedy: str | None = None
     return InputError(path, f"is not a valid trajectory (line {line}: {cause})", remedy or REMEDIES[kind])
 
 
-def _lines(path: Path) -> tuple[str, Lines]:
-    """Format of a file and its lines, without blank ones, comments (except a header line) and repeated ones."""
-    kind = path.suffix.lower()
-    if kind == ".geojson":
+def _text(path: Path) -> str:
+    if path.suffix.lower() == ".geojson":
         raise InputError(path, "is GeoJSON, which can only be written", "Give the .csv beside it")
     file_checks.check(path)
     try:
-        text = tables.read_text(path)
+        return tables.read_text(path)
     except InputError as error:  # binary, such as SBET
         raise foreign_files.unread(path, error.cause, error.remedy) from None
+
+
+def _lines(path: Path, text: str) -> tuple[str, Lines]:
+    """Format of a file's text and its lines, without blank ones and comments (except a header line)."""
+    kind = path.suffix.lower()
     filled = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     plain = [(i, line) for i, line in filled if not line.lstrip().startswith("#")]
     if not plain:
@@ -194,6 +210,22 @@ def _lines(path: Path) -> tuple[str, Lines]:
     if decimal_commas:
         plain = [(i, line.replace(",", ".")) for i, line in plain]
     return kind, [(i, line.split(delimiter)) for i, line in plain]
+
+
+def _from_lines(
+    path: Path, kind: str, lines: Lines, frame: Frame, times: F64 | None, timed: bool
+) -> tuple[Trajectory, Lines]:
+    """Poses in the order of the file, and their lines: those that repeat the previous one are left out."""
+    if kind == ".kitti":
+        if timed and times is None:
+            raise InputError(path, "has no times", REMEDIES[".csv"])
+        return _from_kitti(path, lines, frame, times), lines
+    columns: tuple[str, ...] = POSITION_COLUMNS + QUATERNION_COLUMNS
+    if kind == ".csv":
+        columns, lines = _header_line(path, lines)
+    if {"time", "sec"} & set(columns):  # without times, repeated lines are those of a stationary vehicle
+        lines = [one for one, before in zip(lines, [(0, [""]), *lines], strict=False) if one[1] != before[1]]
+    return _from_columns(path, kind, columns, lines, frame, times, timed), lines
 
 
 def _other_order(comments: Sequence[str]) -> list[str]:

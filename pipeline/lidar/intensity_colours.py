@@ -22,8 +22,10 @@ LEVEL_RADIUS_M = 3.0
 """Distance at which the weight of a cell's median in the surroundings falls to 1/e: far wider than lane markings."""
 LEVEL_NEIGHBOURS = 48
 DARK_PERCENTILE, BRIGHT_PERCENTILE = 2.0, 98.0
-SHADES, GROUND_SHADES = (0.55, 1.25), (0.8, 1.15)
-"""Factors on the tint at these percentiles of a class's contrast; the ground is even, but for its markings."""
+SHADES, EVEN_SHADES = (0.55, 1.25), (0.8, 1.15)
+"""Factors on the tint at these percentiles of a class's contrast; the latter of `EVEN` classes."""
+EVEN = ("terrain", "wall", "ceiling", "furniture")
+"""The ground, but for its markings, and surfaces of rooms, whose contrast is mostly that of the range and the angle."""
 MARKING_SIGMAS = (1.8, 3.6)
 """Contrast on the ground, in robust standard deviations, from which points turn white, and are white."""
 MARKING_RGB = (235, 235, 230)
@@ -51,6 +53,7 @@ def intensity_colours(cloud: PointCloud, path: Trajectory | None = None, tint: U
     rgb = tint[code].astype(np.float32)
     strength = cloud.intensity.astype(np.float32)
     merged = np.where(is_ground[code], CODE["terrain"], code)  # the ground is one surface
+    even = {CODE[name] for name in EVEN}
     for one in np.unique(merged).tolist():
         rows = np.flatnonzero(merged == one)
         if len(rows) < intensity.MIN_POINTS:
@@ -60,7 +63,7 @@ def intensity_colours(cloud: PointCloud, path: Trajectory | None = None, tint: U
             contrast[_at_foot(cloud.xyz, code, rows)] = 0
         low, high = np.percentile(contrast, (DARK_PERCENTILE, BRIGHT_PERCENTILE)).tolist()
         share = np.clip((contrast - low) / max(high - low, 1e-6), 0, 1)
-        dark, bright = GROUND_SHADES if is_ground[one] else SHADES
+        dark, bright = EVEN_SHADES if one in even else SHADES
         rgb[rows] *= (dark + (bright - dark) * share)[:, None]
         if is_ground[one]:
             white = _marking(contrast)[:, None]

@@ -7,7 +7,7 @@ from pathlib import Path
 from scan2sim.pipeline.core.types import Tile
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
-from scan2sim.pipeline.plausibility import cameras, cloud
+from scan2sim.pipeline.plausibility import cameras, classes, cloud
 from scan2sim.pipeline.plausibility.finding import Finding
 from scan2sim.pipeline.pose_check.photo_fit import sample_points
 
@@ -38,6 +38,7 @@ def find_implausible(tile: Tile) -> list[str]:
             cloud.far_points(points),
             cloud.density(points, sum(clouds.read_header(path).count for path in tile.clouds)),
             cloud.level_ground(points),
+            classes.ground_classes(points),
         ]
     views = [view for view in tile.views if view.camera.model != "orthographic"]
     found += [cameras.distance(views, points), cameras.heights(views, points)]

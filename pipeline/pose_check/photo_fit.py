@@ -93,15 +93,20 @@ class Fit:
 
 
 def sample_points(tile: Tile) -> PointCloud:
-    """About `max_points` of a tile's points, evenly in their order.
+    """About `max_points` of a tile's points, evenly in their order, with our class codes.
 
     Raises:
         ScanError: a cloud can't be read.
     """
     count = sum(clouds.read_header(path).count for path in tile.clouds)
     stride = max(1, count // LIMITS.max_points)
-    parts = [part.take(slice(0, None, stride)) for path in tile.clouds for part in clouds.chunks(path, tile.frame)]
-    return PointCloud.join([_in_frame(part, tile.frame) for part in parts])
+    parts = []
+    for path in tile.clouds:
+        table = clouds.code_table(path, tile.classes)
+        for part in clouds.chunks(path, tile.frame):
+            one = _in_frame(part.take(slice(0, None, stride)), tile.frame)
+            parts.append(one if one.classification is None else replace(one, classification=table[one.classification]))
+    return PointCloud.join(parts)
 
 
 def _in_frame(cloud: PointCloud, frame: Frame) -> PointCloud:

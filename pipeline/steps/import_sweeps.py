@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.importers import sweeps
 from scan2sim.pipeline.io import trajectory_check
 from scan2sim.pipeline.io.calibration import camera_of_photos, photo_extrinsics, read_extrinsics
-from scan2sim.pipeline.io.rig import RIG, read_rig
+from scan2sim.pipeline.io.rig import RIG, masks_of_rig, read_rig
 from scan2sim.pipeline.pose_check.check import check_photos
 
 
@@ -21,7 +22,9 @@ class SweepsParams(sweeps.PlacementParams):
     """How sweeps are registered, and photos are added."""
 
     camera: str = Field(
-        "auto", description="Camera model of the photos: auto, pinhole, equirectangular, or a TOML file as in a tile."
+        "auto",
+        description="Camera model of the photos: auto, pinhole, equirectangular, or a file: TOML as in a tile, or the "
+        "calibration of another program (docs/inputs.md).",
     )
     focal: Focal | None = Field(None, description="Focal length of a pinhole camera in pixels.")
     centre: tuple[Pixels, Pixels] | None = Field(
@@ -56,8 +59,8 @@ def build_tile(
 
     Args:
         inputs: `sweeps` and `poses`; optional `extrinsics`, `times`, `photos` (a folder of photos, or of a rig of
-            cameras), `photo_times`, `mask`, `camera`, a file with the photos' camera, and `trajectory_check`, the
-            folder of a check of the poses.
+            cameras), `photo_times`, `mask` (of a rig: see `masks_of_rig`), `camera`, a file with the photos' camera,
+            and `trajectory_check`, the folder of a check of the poses.
         params: settings.
         warn, report, link, overwrite, name: see `pipeline.importers.sweeps.import_sweeps`.
         conventions: look for usual mistakes in the photos' poses; without, only for offsets.
@@ -69,10 +72,13 @@ def build_tile(
     pictures = list[sweeps.PhotoInput]()
     is_rig = photos is not None and (photos / RIG).is_file()
     if photos is not None and is_rig:
-        for one in read_rig(photos):
+        rig = read_rig(photos)
+        masks = masks_of_rig(inputs.get("mask"), [one.id for one in rig])
+        for one in rig:
             T = one.T_camera_scanner
             T = np.linalg.inv(T).astype(np.float64) if params.invert_extrinsics else T
-            pictures.append(sweeps.PhotoInput(photos / one.id, one.camera, extrinsics=T, id=one.id, subfolder=True))
+            own = sweeps.PhotoInput(photos / one.id, one.camera, extrinsics=T, id=one.id, subfolder=True)
+            pictures.append(replace(own, mask=masks.get(one.id)))
     elif photos is not None:
         file = inputs.get("camera")
         camera = camera_of_photos(

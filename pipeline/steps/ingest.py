@@ -14,6 +14,7 @@ from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.parameters import Coordinate
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import Frame, PointCloud
+from scan2sim.pipeline.io import label_sets
 from scan2sim.pipeline.io.tile import MIN_POINTS
 
 MAX_EXTENT_M = 5000.0
@@ -58,7 +59,7 @@ def ingest(inputs: Inputs, params: IngestParams, out: Path, report: Report) -> D
         warnings += [f"{inputs[name].name}: {note}" for note in notes if note]
         if cloud.classification is not None and len(cloud):
             table = clouds.code_table(inputs[name], params.context.classes)
-            unmapped = classes.unmapped_codes_warning(np.bincount(cloud.classification, minlength=256), table)
+            unmapped = label_sets.codes_warning(np.bincount(cloud.classification, minlength=256), table)
             warnings += [f"{inputs[name].name}: {unmapped}"] if unmapped else []
             cloud = replace(cloud, classification=table[cloud.classification])
         finite = np.atleast_1d(np.isfinite(cloud.xyz).all(axis=1))
@@ -115,4 +116,4 @@ def _missing_attributes(parts: Sequence[PointCloud], names: Sequence[str]) -> li
     return found
 
 
-INGEST = Step("ingest", 3, ingest, IngestParams, memory=(0.4, 12))
+INGEST = Step("ingest", 4, ingest, IngestParams, memory=(0.4, 12))

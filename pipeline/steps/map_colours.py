@@ -44,4 +44,4 @@ def map_colours(inputs: Inputs, params: MapColoursParams, out: Path, report: Rep
     return Done({"cloud": file, "source": out / "source.json"}, about)
 
 
-MAP_COLOURS = Step("map_colours", 4, map_colours, MapColoursParams)
+MAP_COLOURS = Step("map_colours", 5, map_colours, MapColoursParams)

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.classes import unmapped_codes_warning
 from scan2sim.pipeline.core.errors import DataError, InputError, SettingError
 from scan2sim.pipeline.core.parameters import MAX_NAME, Buffer, Length, Metres, Stretch
 from scan2sim.pipeline.core.step import Params, Report, silent
@@ -28,6 +27,7 @@ from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import orthophoto
+from scan2sim.pipeline.io.label_sets import codes_warning
 from scan2sim.pipeline.io.survey import read_survey, write_survey
 from scan2sim.pipeline.io.tile import MIN_POINTS, TileFile, read_spec, read_tile, tile_name, write_tile
 from scan2sim.pipeline.io.tile_folder import add_file, tile_folder
@@ -257,7 +257,7 @@ def _assign(
                     chosen = rows[points[in_tile]]
                     chosen["own"] = in_tile < len(xy)
                     spool.add(int(tiles[in_tile[0]]), chosen, part)
-        notes = unmapped_codes_warning(count, table), clouds.left_out(declared, done - before)
+        notes = codes_warning(count, table), clouds.left_out(declared, done - before)
         warnings += [f"{cloud.name}: {note}" for note in notes if note]
     return far, warnings
 

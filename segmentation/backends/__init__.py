@@ -23,6 +23,8 @@ class NetworkInfo:
         licence: licence of the weights, as stated in the file.
         pixels_per_radian: angular resolution to which photos should be resampled; None: their own.
         channels: whether it takes `segmentation.lidar_channels`.
+        size: height and width of its input, if they are fixed.
+        assumed: what was assumed about its input, as nothing states it; empty: nothing.
     """
 
     name: str
@@ -31,6 +33,8 @@ class NetworkInfo:
     licence: str
     pixels_per_radian: float | None
     channels: bool = False
+    size: tuple[int, int] | None = None
+    assumed: str = ""
 
 
 class Network(Protocol):
@@ -39,7 +43,7 @@ class Network(Protocol):
     info: NetworkInfo
 
     def probabilities(self, seen: U8) -> F32:
-        """(C, h, w) float32 probabilities of the labels, which sum to 1; h, w may be a fraction of H, W.
+        """(C, h, w) float32 probabilities of the labels, which sum to 1 or are all 0; h, w may be a fraction of H, W.
 
         Args:
             seen: (H, W, 3) uint8 colours; for a network with `channels` (H, W, 7), with them, 0 where unknown.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -13,16 +12,22 @@ import numpy as np
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, U8
 from scan2sim.segmentation.backends import NetworkInfo, require_weights, torch_device
+from scan2sim.segmentation.huggingface import (
+    CONFIG,
+    PREPROCESSOR,
+    WEIGHTS,
+    Normalisation,
+    label_names,
+    read_json,
+    read_normalisation,
+)
 
 NEEDS = ("torch", "safetensors", "transformers")
-MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Mean and standard deviation of ImageNet's red, green and blue (0 to 1), with which most networks were trained."""
-FILES = ("model.safetensors", "pytorch_model.bin")
 ARCHITECTURE = "SegformerForSemanticSegmentation"
 NVIDIA = "NVIDIA's SegFormer weights are for non-commercial use"
 MIN_SIDE_PX = 32
 """Smallest side of a photo that the network can take."""
-REMEDY = f"Pass a local folder with config.json and {FILES[0]} of a {ARCHITECTURE}; nothing is downloaded"
+REMEDY = f"Pass a local folder with config.json and {WEIGHTS[0]} of a {ARCHITECTURE}; nothing is downloaded"
 
 
 def check(weights: Path | None) -> None:
@@ -44,14 +49,15 @@ class Network:
     """See `segmentation.backends.Network`; h, w are a quarter of H, W, rounded up."""
 
     def __init__(self, path: Path, device: str) -> None:
-        file = next((path / name for name in FILES if (path / name).is_file()), path)
+        file = next((path / name for name in WEIGHTS if (path / name).is_file()), path)
         if not file.is_file():
             raise InputError(
-                path, f"no {' or '.join(FILES)} in this folder" if path.is_dir() else "file not found", REMEDY
+                path, f"no {' or '.join(WEIGHTS)} in this folder" if path.is_dir() else "file not found", REMEDY
             )
-        config = _read_json(file.with_name("config.json"))
-        labels = _labels(config, file.with_name("config.json"))
-        self._scale, self._mean, self._std = _normalisation(file.with_name("preprocessor_config.json"))
+        config = read_json(file.with_name(CONFIG), REMEDY)
+        labels = _labels(config, file.with_name(CONFIG))
+        preprocessor = file.with_name(PREPROCESSOR)
+        self._normalise = read_normalisation(preprocessor) if preprocessor.is_file() else Normalisation()
         self._device = device
         self._net = _build(config, labels, _state(file), file).eval().to(device)
         name, digest = (path if path.is_dir() else file).name, hashlib.sha256(file.read_bytes()).hexdigest()
@@ -65,9 +71,7 @@ class Network:
 
         with torch.inference_mode():
             try:
-                x = torch.from_numpy(np.ascontiguousarray(seen)).to(self._device).permute(2, 0, 1)[None].float()
-                mean, std = (torch.from_numpy(v).to(self._device)[:, None, None] for v in (self._mean, self._std))
-                x = (x * self._scale - mean) / std
+                x = torch.from_numpy(self._normalise(seen)).to(self._device).permute(2, 0, 1)[None]
                 if min(seen.shape[:2]) < MIN_SIDE_PX:
                     x = interpolate(x, [max(n, MIN_SIDE_PX) for n in seen.shape[:2]], mode="bilinear")
                 with torch.autocast("cuda", torch.float16, enabled=self._device.startswith("cuda")):
@@ -78,58 +82,13 @@ class Network:
                 raise MemoryError(str(error)) from None
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        config = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(path, f"can't be read ({error})", REMEDY) from None
-    if not isinstance(config, dict):
-        raise InputError(path, "not a JSON object", REMEDY)
-    return config
-
-
 def _labels(config: dict[str, Any], path: Path) -> tuple[str, ...]:
     """Label names by channel from the config of a SegFormer; InputError for another architecture."""
     architectures = config.get("architectures") or [config.get("model_type", "another network")]
     names = [str(name) for name in (architectures if isinstance(architectures, list) else [architectures])]
     if not {ARCHITECTURE, "segformer"} & set(names):
         raise InputError(path, f"config of {', '.join(names)}, not of {ARCHITECTURE}", REMEDY)
-    try:
-        labels = {int(key): str(name) for key, name in config["id2label"].items()}
-    except (KeyError, AttributeError, ValueError):
-        labels = {}
-    if not labels or sorted(labels) != list(range(len(labels))):
-        raise InputError(path, "id2label doesn't name every channel from 0 on", "Add the missing label names")
-    return tuple(labels[i] for i in range(len(labels)))
-
-
-def _normalisation(path: Path) -> tuple[float, F32, F32]:
-    """Scale of grey levels 0 to 255, mean and standard deviation; ImageNet's if the file is missing."""
-    preprocessor = _read_json(path) if path.is_file() else {}
-    (scale,) = normalisation(
-        [preprocessor.get("rescale_factor", 1 / 255) if preprocessor.get("do_rescale", True) else 1], 1, path
-    )
-    if not preprocessor.get("do_normalize", True):
-        return float(scale), np.zeros(3, np.float32), np.ones(3, np.float32)
-    std = normalisation(preprocessor.get("image_std", STD), 3, path)
-    return float(scale), normalisation(preprocessor.get("image_mean", MEAN), 3, path, minimum=-np.inf), std
-
-
-def normalisation(value: object, n: int, path: Path, minimum: float = 1e-6) -> F32:
-    """(n,) float32 of a value for the normalisation of photos from a file.
-
-    Raises:
-        InputError: the value is not n finite numbers of at least `minimum`.
-    """
-    try:
-        found = np.asarray(value, np.float32)
-    except (TypeError, ValueError):
-        found = np.empty(0, np.float32)
-    if found.shape != (n,) or not np.isfinite(found).all() or found.min() < minimum:
-        raise InputError(
-            path, f"invalid value {value!r} for the normalisation of photos", f"Change it to {n} valid numbers"
-        )
-    return found
+    return label_names(config, path)
 
 
 def _state(path: Path) -> dict[str, Any]:
@@ -145,10 +104,10 @@ def _state(path: Path) -> dict[str, Any]:
     except Exception as error:  # damaged files raise many types of exceptions
         code = re.search(r"GLOBAL (\S+)", str(error))
         if code:
-            remedy = f"Ask its author for {FILES[0]}, which can't contain code"
+            remedy = f"Ask its author for {WEIGHTS[0]}, which can't contain code"
             raise InputError(path, f"contains code or objects besides tensors; not run ({code[1]})", remedy) from None
         why = str(error).rpartition("WeightsUnpickler error:")[2].strip().split("\n")[0] or type(error).__name__
-        remedy = f"Copy or download it again, or ask its author for {FILES[0]}"
+        remedy = f"Copy or download it again, or ask its author for {WEIGHTS[0]}"
         raise InputError(path, f"not a complete file of only tensors ({why})", remedy) from None
     if not isinstance(state, dict) or not all(isinstance(value, torch.Tensor) for value in state.values()):
         raise InputError(path, "not a dictionary of tensors", "Save only the network's `state_dict()`")

@@ -1,7 +1,8 @@
 """Dataset of labelled photos for training and validation: `images/*.jpg` (or png) and `labels/*.png` of the same names.
 
-Labels are LAS class codes per pixel (0 sky, 255 ignored), as written by `data_samples.training`. Lidar channels of the
-photos may be in `channels/*.png`, encoded by `segmentation.lidar_channels`.
+Labels are LAS class codes per pixel (0 sky, 255 ignored), as written by `data_samples.training`, or the indices of the
+names in `labels.txt` (one per line), as grey levels or with a palette. Lidar channels of the photos may be in
+`channels/*.png`, encoded by `segmentation.lidar_channels`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import DataError
 from scan2sim.pipeline.core.types import U8
-from scan2sim.segmentation.labels import index_of_code
+from scan2sim.segmentation.label_images import NAMES, read_classes
 from scan2sim.segmentation.lidar_channels import CHANNELS, DOWNSAMPLING
 
 
@@ -46,6 +47,11 @@ def split(found: Sequence[tuple[Path, Path]], share: float) -> tuple[list[tuple[
     return (training, validation) if training else (list(found), [])
 
 
+def names_of(truth: Path) -> Path:
+    """File with the names of the labels in a label image's data set."""
+    return truth.parent.parent / NAMES
+
+
 def read(image: Path, truth: Path) -> tuple[U8, U8]:
     """(H, W, 3) colours and (H, W) class indices, `IGNORED` for pixels without a class.
 
@@ -54,10 +60,10 @@ def read(image: Path, truth: Path) -> tuple[U8, U8]:
     """
     import cv2
 
-    bgr, codes = cv2.imread(str(image)), cv2.imread(str(truth), cv2.IMREAD_GRAYSCALE)
-    if bgr is None or codes is None or bgr.shape[:2] != codes.shape:
-        raise DataError(truth, "the label file or its image can't be read, or their sizes differ", "Create both again")
-    return np.asarray(bgr[..., ::-1], np.uint8), index_of_code()[codes]
+    bgr, classes = cv2.imread(str(image)), read_classes(truth, names_of(truth))
+    if bgr is None or bgr.shape[:2] != classes.shape:
+        raise DataError(truth, "its image can't be read, or their sizes differ", "Create both again")
+    return np.asarray(bgr[..., ::-1], np.uint8), classes
 
 
 def read_channels(image: Path, size: tuple[int, int]) -> U8:

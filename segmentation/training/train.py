@@ -18,11 +18,12 @@ import torch.nn.functional as F
 
 from scan2sim.pipeline.core.step import Report, silent
 from scan2sim.pipeline.core.types import F32, I64
-from scan2sim.segmentation.labels import CLASSES, IGNORED, index_of_code
+from scan2sim.segmentation.label_images import read_classes
+from scan2sim.segmentation.labels import CLASSES, IGNORED
 from scan2sim.segmentation.lidar_channels import CHANNELS
 from scan2sim.segmentation.network import StreetNet
 from scan2sim.segmentation.training.augment import augment
-from scan2sim.segmentation.training.dataset import pairs, read, read_channels, split
+from scan2sim.segmentation.training.dataset import names_of, pairs, read, read_channels, split
 
 AVERAGING_RATE = 0.002
 """Share of a step's weights in the exponential moving average."""
@@ -134,11 +135,9 @@ def one_cycle(done: float) -> float:
 
 def class_weights(truth: Sequence[Path]) -> torch.Tensor:
     """(C,) weights of the loss by class: inverse root of the class's share, so that rare classes count more."""
-    import cv2
-
     count = np.zeros(256)
     for file in truth[:: max(1, len(truth) // 100)]:
-        count += np.bincount(index_of_code()[cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)].ravel(), minlength=256)
+        count += np.bincount(read_classes(file, names_of(file)).ravel(), minlength=256)
     share = count[: len(CLASSES)] / count[: len(CLASSES)].sum()
     weight = np.where(share > 0, 1 / np.sqrt(np.maximum(share, 4e-3)), 0)
     return torch.tensor(weight / weight[weight > 0].mean(), dtype=torch.float32)

@@ -1,7 +1,7 @@
 """Detectors in ONNX files of other projects: recognized by their inputs and outputs, prepared for and decoded.
 
 A format is recognized once, from the outputs for a grey image; nothing has to be declared. Class names are those of the
-file's metadata (`names` or `labels`), of `<name>.labels.txt`, or COCO's.
+file's metadata (`names` or `labels`), of `<name>.labels.txt`, of a `config.json` beside it, or COCO's.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def class_names(path: Path, metadata: dict[str, str]) -> tuple[str, ...] | None:
     except (KeyError, ValueError, SyntaxError, TypeError):
         if "labels" in metadata or path.with_suffix(".labels.txt").is_file():
             return onnx_session.read_labels(path, metadata)
-        return None
+        return onnx_session.config_labels(path)
 
 
 Names = tuple[str, ...] | None

@@ -61,7 +61,7 @@ class Segmentation(ResultModel):
 
     labels: tuple[str, ...] = Field(description="Names of the classes, indexed by the values of the mask.")
     shares: dict[str, float] = Field(description="Fraction of the pixels by class, for the classes that occur.")
-    mask: str = Field(description="Class indices as an 8-bit greyscale PNG in base64.")
+    mask: str = Field(description="Class indices as an 8-bit greyscale PNG in base64; 255: none.")
     size: tuple[int, int] = Field(description="Width and height of the mask in pixels; it covers the whole image.")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import Camera
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of
+from scan2sim.pipeline.io.camera_info import InvalidCamera, camera_of
 from scan2sim.services.toolboxes.frames import check_size
 
 MIN_FOCAL, MAX_FOCAL, MAX_CENTRE = 0.01, 20.0, 2.0

@@ -13,7 +13,7 @@ import numpy as np
 
 from scan2sim.pipeline.camera import panorama
 from scan2sim.pipeline.camera.lens import changed_lens
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.io.images import exif
 from scan2sim.slam.calibration.calibrate import calibrated, calibrated_from_scratch
@@ -24,6 +24,8 @@ from scan2sim.slam.video import Video
 EXIF_SIGMA = np.array([0.05, 0.05, 0.05, 0.1, 0.03])
 """Standard deviation of a lens from EXIF, in the parameters of `lens.UNKNOWN_SIGMA`: it is in whole millimetres,
 videos show only a part of the sensor, and distortion isn't known."""
+MODELS = ("auto", "pinhole", "equirectangular")
+"""Camera models that can be named."""
 FILM_DIAGONAL_MM = math.hypot(36, 24)
 """Diagonal of the film that "35 mm equivalent" refers to (CIPA DCG-001)."""
 
@@ -102,9 +104,13 @@ def camera_of(
     None for a perspective camera without a focal length.
 
     Raises:
+        SettingError: unknown model.
         InputError: the camera is equirectangular, but the aspect ratio isn't 2:1; or the camera is to be found, and
             frames of that ratio don't show the whole sphere.
     """
+    if model not in MODELS:
+        remedy = f"Use {', '.join(MODELS)}, or a file (docs/inputs.md)"
+        raise SettingError("--camera", f"unknown model {model!r}", remedy)
     w, h = video.width, video.height
     if model == "auto" and w == 2 * h and focal is None:
         panorama.check(video.path, video.first_grey())

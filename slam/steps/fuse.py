@@ -49,6 +49,7 @@ class FuseParams(Params):
 
     Attributes:
         scanner_poses: treat the poses as scanner poses even if extrinsics are given.
+        invert_extrinsics: the extrinsics are T_scanner_camera.
         time_offset: seconds to add to the times of sweeps and photos.
         gps_offset: seconds to add to GPS times, to convert them to the clock of the trajectory, or of the sweeps.
         crs: projected CRS of the poses, such as "EPSG:32633"; "local" if they aren't georeferenced.
@@ -56,6 +57,9 @@ class FuseParams(Params):
     """
 
     scanner_poses: bool = Field(False, description="Treat the poses as scanner poses even if extrinsics are given.")
+    invert_extrinsics: bool = Field(
+        False, description="The extrinsics are T_scanner_camera: from camera axes to scanner axes."
+    )
     time_offset: Shift = Field(0.0, description="Seconds to add to the times of sweeps and photos.")
     gps_offset: Shift = Field(0.0, description="Seconds to add to GPS times.")
     crs: str = Field("local", description='CRS of the poses: "EPSG:32633", or "local".')
@@ -81,6 +85,8 @@ def fuse_path(inputs: Inputs, params: FuseParams, out: Path, report: Report) -> 
         path, frame = given
         if "extrinsics" in inputs and not params.scanner_poses:
             T_camera_scanner = read_extrinsics(inputs["extrinsics"])
+            if params.invert_extrinsics:
+                T_camera_scanner = np.asarray(np.linalg.inv(T_camera_scanner), np.float64)
         camera = _camera(path, times, inputs["poses"])
         first = interpolate(path.poses, path.times, times[:1])[0] @ T_camera_scanner
     fixes = None

@@ -11,11 +11,12 @@ from pydantic import Field
 from scan2sim.pipeline.camera.lens import GIVEN_SIGMA, LENS_MODELS
 from scan2sim.pipeline.core import plugins
 from scan2sim.pipeline.core.blas_threads import one_blas_thread
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate, Shift
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import U8, Camera, GpsTrack
 from scan2sim.pipeline.io import gps as gps_io
+from scan2sim.pipeline.io.calibration import read_camera
 from scan2sim.pipeline.io.images import image
 from scan2sim.slam import features, lens, matchers, solvers, trackers
 from scan2sim.slam.calibration import calibrate
@@ -38,7 +39,11 @@ that fit their lens aren't repeated, others once; more if the lens is so wrong t
 class Filmed(Params):
     """Camera, timing and backends of a video's odometry."""
 
-    camera: str = Field("auto", description="Camera model: equirectangular, pinhole, or auto (by the aspect ratio).")
+    camera: str = Field(
+        "auto",
+        description="Camera model: equirectangular, pinhole, or auto (by the aspect ratio); or a file: TOML as in a "
+        "tile, or the calibration of another program (docs/inputs.md).",
+    )
     focal: Focal | None = Field(
         None, description="Focal length of a pinhole camera in pixels; default: from EXIF, or self-calibration."
     )
@@ -95,7 +100,9 @@ class TrackParams(OdometryParams, Filmed):
 
 @one_blas_thread()
 def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, checkpoint: Path) -> Done:
-    """Visual odometry over `video` (a file, or a folder of images with `times`), with optional `gps`, `mask`, weights.
+    """Visual odometry over `video` (a file, or a folder of images with `times`).
+
+    Optional inputs: `gps`, `mask`, `camera` (a file of cameras), weights.
 
     Raises:
         InputError: an input can't be read, or the camera is unknown.
@@ -107,7 +114,7 @@ def track_video(inputs: Inputs, params: TrackParams, out: Path, report: Report, 
     def track_log() -> TrackLog:
         return record_tracks(video, mask, every=params.every, until=params.until or None, report=report)
 
-    camera, estimated = video_camera(video, params, track_log, checkpoint / "lens.json")
+    camera, estimated = video_camera(video, params, track_log, checkpoint / "lens.json", inputs.get("camera"))
     warnings: list[str] = []
     gps = read_gps(video, inputs.get("gps"), params.gps_offset, warnings.append)
     description = ""
@@ -207,16 +214,22 @@ def can_track(params: TrackParams) -> None:
 
 
 def video_camera(
-    video: Video, params: TrackParams, track_log: Callable[[], TrackLog], cache: Path
+    video: Video, params: TrackParams, track_log: Callable[[], TrackLog], cache: Path, file: Path | None = None
 ) -> tuple[Camera, EstimatedCamera | None]:
-    """Camera of the frames: from a tile, from the options, or estimated; an estimate is stored in the file `cache`.
+    """Camera of the frames: from a file or tile, from the options, or estimated; `cache` stores an estimate.
 
     Raises:
-        InputError: the camera is unknown.
+        InputError: the camera is unknown. SettingError: a file and a number are given.
     """
-    given = _tile_camera(video, params) or camera_of(
-        video, params.camera, params.focal, params.centre, params.k1, params.k2
-    )
+    if file is not None:
+        for name in ("focal", "centre", "k1", "k2"):
+            if getattr(params, name) is not None:
+                raise SettingError(f"--{name}", "is given beside a file with the camera", "Leave one of them out")
+        given: Camera | None = read_camera(file, video.width, video.height, names=(video.path.stem,))
+    else:
+        given = _tile_camera(video, params) or camera_of(
+            video, params.camera, params.focal, params.centre, params.k1, params.k2
+        )
     estimated = EstimatedCamera.read(cache) or estimated_camera(video, given, track_log, calibrate=params.calibrate)
     if estimated is not None:
         estimated.write(cache)
@@ -226,16 +239,17 @@ def video_camera(
 
 
 def _tile_camera(video: Video, params: TrackParams) -> Camera | None:
-    for given in params.context.cameras:
-        camera = Camera(**given | {"distortion": tuple(given["distortion"])})
-        if (camera.width, camera.height) == (video.width, video.height):
-            return camera
-    if params.context.cameras:
-        size = f"{video.width}x{video.height}"
+    if not params.context.cameras:
+        return None
+    cameras = [Camera(**given | {"distortion": tuple(given["distortion"])}) for given in params.context.cameras]
+    fitting = [one for one in cameras if (one.width, one.height) == (video.width, video.height)]
+    if len(fitting) != 1:
+        count, size = "several cameras" if fitting else "no camera", f"{video.width}x{video.height}"
         raise InputError(
-            video.path, f"the tile has no camera with an image size of {size}", "Give --camera and --focal"
-        )
-    return None
+            video.path, f"the tile has {count} with an image size of {size}",
+            "Give a file by --camera, or leave out --tile and give --focal",
+        )  # fmt: skip
+    return fitting[0]
 
 
 def read_gps(video: Video, path: Path | None, offset: float | None, warn: Callable[[str], None]) -> GpsTrack | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
@@ -16,6 +17,7 @@ from scan2sim.flows.pipelines.bag import BagSource, build_graph
 from scan2sim.flows.pipelines.graph import Task
 from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io.images.image import read_rgb
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.pose_check.conventions import AXES
 from tests.fakes.bags import BagFile, bag_file, records
@@ -38,6 +40,7 @@ from tests.pipeline.importers.bag.test_unpack import (
     urdf,
     write,
 )
+from tests.present import present
 
 
 @pytest.fixture(autouse=True)
@@ -93,6 +96,26 @@ def test_conventions_of_the_extrinsics_apply_to_the_cameras_of_a_bag(tmp_path: P
     expected[:3, :3] = expected[:3, :3] @ AXES["ros"]
     expected[:3, 3] -= tile.frame.origin
     assert np.allclose(tile.views[0].T_world_cam, expected, atol=1e-5)
+
+
+def test_each_camera_has_its_mask_of_the_vehicle(tmp_path: Path) -> None:
+    path, masks = write(tmp_path / "bag", "mcap", tf, rear, points), tmp_path / "masks"
+    masks.mkdir()
+    mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
+    mask[20:] = 0
+    cv2.imwrite(str(masks / "front.png"), mask)
+    words = ("import", "bag", path, "--out", tmp_path / "tile", "--overwrite", "--deskew", "none", "--min-range", 0)
+    result = command(*words, "--mask", masks)
+    assert result.exit_code == 0, result.output
+    own = {view.photo.parent.name: view.mask for view in read_tile(tmp_path / "tile").views}
+    assert own["rear"] is None and np.array_equal(read_rgb(present(own["front"]))[..., 0], mask)
+    alone = command(*words, "--camera", "/front/image_raw", "--mask", masks / "front.png")
+    assert alone.exit_code == 0, alone.output
+    assert all(view.mask is not None for view in read_tile(tmp_path / "tile").views)
+    for bad, text in ((masks / "front.png", "one mask for several cameras"), (tmp_path / "bag", "has the masks none")):
+        assert text in str(command(*words, "--mask", bad).exception)
+    without = command(*words, "--camera", "none", "--mask", masks)
+    assert isinstance(without.exception, SettingError) and "--mask" in str(without.exception)
 
 
 def test_photos_of_several_cameras_and_the_vehicle_in_the_sweeps(tmp_path: Path) -> None:

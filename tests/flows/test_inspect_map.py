@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from scan2sim.data_samples.building import Style
 from scan2sim.data_samples.mesh_model import write
@@ -60,3 +61,26 @@ def test_up_axis_and_unit_of_a_mesh(tmp_path: Path) -> None:
         found = facts(source)
         assert found["up axis"].startswith("y") and found["units"].startswith("mm")
         assert "triangles" in found
+
+
+def test_up_axis_of_a_gltf_is_named_in_its_own_axes(tmp_path: Path) -> None:
+    """A box shows nothing: y is up by the specification. A room that lies on its side shows that z is."""
+    box = trimesh.creation.box((4.0, 2.0, 2.5))
+    box.export(tmp_path / "box.glb")
+    assert facts(tmp_path / "box.glb")["up axis"].startswith("y,")
+    path, *_ = write(tmp_path / "room", file_format="glb", up="y", edge=0.4, style=Style(rooms=1))
+    assert facts(path)["up axis"].startswith("y,")
+    scene = trimesh.load_scene(path)
+    scene.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    scene.export(tmp_path / "z_up.glb")
+    assert facts(tmp_path / "z_up.glb")["up axis"].startswith("z,")
+
+
+def test_triangles_of_a_mesh_include_repeated_parts(tmp_path: Path) -> None:
+    scene = trimesh.Scene({"box": trimesh.creation.box((4.0, 2.0, 2.5))})
+    for x in (8.0, 16.0):
+        shift = trimesh.transformations.translation_matrix((x, 0, 0))
+        scene.graph.update(frame_from="world", frame_to=f"at {x}", matrix=shift, geometry="box")
+    scene.export(tmp_path / "boxes.glb")
+    found = facts(tmp_path / "boxes.glb")
+    assert (found["parts"], found["triangles"]) == ("3", "36")

@@ -69,10 +69,11 @@ def test_options_override_the_tile_length_of_a_drive(corridor: Path, tmp_path: P
 def test_new_step_versions_and_changed_files_rerun_steps_of_a_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("video.mp4", "camera.toml", "velodyne/0.bin", "image/0.png"):
+    for name in ("video.mp4", "lens.yaml", "camera.toml", "velodyne/0.bin", "image/0.png"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(name, encoding="utf-8")
-    text = '[slam]\nvideo = "video.mp4"\n[sweeps]\nfolder = "velodyne"\nphotos = "image"\ncamera = "camera.toml"\n'
+    text = '[slam]\nvideo = "video.mp4"\ncamera = "lens.yaml"\n[sweeps]\nfolder = "velodyne"\nphotos = "image"\n'
+    text += 'camera = "camera.toml"\n'
     place, known = drive(tmp_path, text), dict[str, str]()
 
     def changed() -> set[str]:
@@ -92,8 +93,9 @@ def test_new_step_versions_and_changed_files_rerun_steps_of_a_drive(
         assert changed() == {"import_sweeps", "cut"} | checked, name
     (tmp_path / "velodyne/1.bin").write_text("one more", encoding="utf-8")
     assert changed() == {"strip_adjustment", "import_sweeps", "cut"}
-    (tmp_path / "video.mp4").write_text("another", encoding="utf-8")
-    assert changed() == {"track", "georeference", "strip_adjustment", "import_sweeps", "cut"}
+    for name in ("video.mp4", "lens.yaml"):
+        (tmp_path / name).write_text("another", encoding="utf-8")
+        assert changed() == {"track", "georeference", "strip_adjustment", "import_sweeps", "cut"}
 
 
 def test_plan_of_a_drive(corridor: Path, tmp_path: Path) -> None:

@@ -53,6 +53,7 @@ KINDS: dict[str, Kind] = {
     "--set": Kind(tables.written("set.txt", SET_OPTIONS), tables.assignments, tables.every_setting),
     "photos.csv": Kind(tables.photos, tables.read_photos),
     "cameras.toml": Kind(tables.camera_file, tables.read_camera_file),
+    "calibration": Kind(tables.calibration, tables.read_calibration),
     "trajectory csv": Kind(*tables.trajectory(".csv")),
     "trajectory tum": Kind(*tables.trajectory(".tum")),
     "trajectory kitti": Kind(*tables.trajectory(".kitti")),

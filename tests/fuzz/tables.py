@@ -144,6 +144,25 @@ def read_camera_file(folder: Path) -> object:
     return read_camera(folder / "cameras.toml", 64, 48), read_extrinsics(folder / "T.txt")
 
 
+def calibration(folder: Path) -> list[Path]:
+    """Write calibrations of other programs as YAML and as OpenCV's XML."""
+    chain = "{camera_model: pinhole, intrinsics: [50, 50, 31, 23], distortion_model: radtan, "
+    chain += "distortion_coeffs: [0.1, 0, 0, 0], resolution: [64, 48]}"
+    livo = f"extrin_calib: {{Rcl: {np.eye(3).ravel().tolist()}, Pcl: [0, 0, 1]}}"
+    (folder / "chain.yaml").write_text(f"cam0: {chain}\n{livo}\n", encoding="utf-8")
+    file = cv2.FileStorage(str(folder / "camera.xml"), cv2.FILE_STORAGE_WRITE)
+    file.write("camera_matrix", np.array([[50.0, 0, 31], [0, 50, 23], [0, 0, 1]]))
+    file.write("distortion_coefficients", np.zeros((5, 1)))
+    file.release()
+    return [folder / "chain.yaml", folder / "camera.xml"]
+
+
+def read_calibration(folder: Path) -> object:
+    """Read the cameras and the extrinsics."""
+    cameras = [read_camera(folder / name, 64, 48) for name in ("chain.yaml", "camera.xml")]
+    return cameras, read_extrinsics(folder / "chain.yaml")
+
+
 def track(name: str, text: str) -> tuple[Make, Read]:
     """GPS track: writer and reader."""
     return written(name, text), lambda folder: gps_io.read(folder / name)

@@ -58,6 +58,28 @@ def test_large_photos_are_classified_in_tiles_without_seams(camera: Camera) -> N
     assert len(network.seen) > 1 and max(max(size) for size in network.seen) <= classifier.tile
 
 
+@pytest.mark.parametrize(
+    ("size", "fixed", "tile"),
+    [
+        ((1920, 1080), (512, 1024), (768, 1536)),
+        ((1920, 1080), (512, 512), (1080, 1080)),
+        ((1080, 1920), (512, 1024), (540, 1080)),
+        ((300, 200), (1024, 2048), (148, 300)),
+        ((1242, 375), (512, 512), (375, 372)),
+        ((1920, 1080), None, (1080, 1536)),
+    ],
+)
+def test_tiles_have_the_proportions_of_a_fixed_input(
+    size: tuple[int, int], fixed: tuple[int, int] | None, tile: tuple[int, int]
+) -> None:
+    camera = Camera("pinhole", *size, 500.0, 500.0, (size[0] - 1) / 2, (size[1] - 1) / 2)
+    rgb, truth = painted(camera)
+    network = ByColour()
+    network.info = replace(network.info, size=fixed)
+    best, _ = class_map(Classifier(network, "").probabilities(rgb, camera), rgb.shape[:2])
+    assert set(network.seen) == {tile} and (best == truth).mean() > 0.9 and (best != IGNORED).all()
+
+
 def test_tiles_are_reduced_when_memory_is_insufficient() -> None:
     rgb, truth = painted(PINHOLE)
     network = ByColour(memory=400 * 400)
@@ -120,13 +142,60 @@ def test_other_label_sets_are_mapped_by_name() -> None:
     ]  # fmt: skip
     ade = ["wall", "building, edifice", "sky", "floor, flooring", "tree", "ceiling", "road, route", "bed", "grass"]
     assert map_labels(ade, "")[5] == IGNORED and CLASSES[map_labels(ade, "")[4]] == "high_vegetation"
+    ade += ["building", "car", "person", "sidewalk", "plant", "bench", "lamp", "tent"]
+    assert map_labels(ade, "")[-3:].tolist() == [IGNORED] * 3, "buildings and poles of other sets"
     with pytest.raises(InputError, match="unknown label set"):
         map_labels(["cat", "dog"], "pets.onnx")
 
 
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ("Sky Building Pole Road Pavement Tree SignSymbol Fence Car Pedestrian Bicyclist",  # CamVid
+         "sky building pole road sidewalk high_vegetation road_sign wall_or_fence vehicle person person"),
+        ("construction--flat--road construction--structure--building object--traffic-sign--front human--person "
+         "object--vehicle--on-rails marking--general object--support--utility-pole nature--vegetation",  # Vistas
+         "road building road_sign person vehicle road pole high_vegetation"),
+        ("person traffic_light road pavement-merged building-other-merged tree-merged sky-other-merged wall-brick",
+         "person road_sign road sidewalk building high_vegetation sky wall_or_fence"),  # COCO panoptic
+        ("road ground smallpole garage gate vegetation", "road road pole building wall_or_fence high_vegetation"),
+    ],
+)  # fmt: skip
+def test_spellings_of_label_sets_are_known(names: str, expected: str) -> None:
+    assert [CLASSES[i] for i in map_labels(names.split(), "")] == expected.split()
+
+
+def test_labels_of_things_only_are_rejected() -> None:
+    """Networks for instances of COCO have five of our classes, but neither ground nor buildings."""
+    with pytest.raises(InputError, match="unknown label set"):
+        map_labels(["person", "bicycle", "car", "traffic light", "fire hydrant", "bench", "potted plant", "boat"], "")
+    with pytest.raises(InputError, match="unknown label set"):
+        map_labels(["sky", "building", "vegetation", "car"], "")
+
+
+def test_photos_that_show_labels_without_a_class_give_a_warning() -> None:
+    rgb, index = painted(PINHOLE)
+    network = ByColour(("road", "asphalt", "building", "sky", "car", "void", *["tree"] * 6))
+    classifier = Classifier(network, "")
+    classifier.probabilities(np.where(index[..., None] == 5, 20, rgb).astype(np.uint8), PINHOLE)
+    (warning,) = classifier.warnings()
+    assert "by colour: " in warning and "don't count: asphalt (17%). " in warning and "road, sidewalk" in warning
+    sure = Classifier(ByColour(), "")
+    sure.probabilities(rgb, PINHOLE)
+    assert sure.warnings() == []
+
+
 def test_all_labels_map_to_classes_and_codes_round_trip() -> None:
     assert all(ours in CLASSES for table in LABEL_SETS.values() for ours in table.values())
-    assert index_of_code()[code_of_index()].tolist() == list(range(len(CLASSES)))
+    indices = list(range(len(CLASSES)))
+    assert index_of_code()[code_of_index()[indices]].tolist() == indices and code_of_index()[IGNORED] == IGNORED
+
+
+def test_pixels_of_labels_without_a_class_have_none() -> None:
+    rgb, truth = painted(PINHOLE)
+    network = ByColour((*CLASSES[:5], "void", *CLASSES[6:]))
+    best, _ = class_map(Classifier(network, "").probabilities(rgb, PINHOLE), rgb.shape[:2])
+    assert (best == np.where(truth == 5, IGNORED, truth)).mean() > 0.95
 
 
 @pytest.mark.parametrize("turns", [1, 2, 3])

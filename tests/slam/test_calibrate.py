@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from scan2sim.pipeline.camera.lens import changed_lens
 from scan2sim.pipeline.camera.models import inside, project_exactly
-from scan2sim.pipeline.core.errors import InputError
+from scan2sim.pipeline.core.errors import InputError, SettingError
 from scan2sim.pipeline.core.types import Camera
 from scan2sim.slam.calibration.calibrate import calibrated, calibrated_from_scratch
 from scan2sim.slam.calibration.camera import EstimatedCamera, estimated_camera
 from scan2sim.slam.odometry.track_log import TrackLog
+from scan2sim.slam.steps.track import TrackContext, TrackParams, video_camera
 from scan2sim.slam.video import open_video
 from tests.fakes.slam_drive import LENS, drive, scatter
 from tests.present import present
@@ -65,6 +69,31 @@ def test_focal_length_is_read_from_exif(tmp_path: Path) -> None:
     video = open_video(write_images(tmp_path / "a", focal=28))
     own = present(estimated_camera(video, None, lambda: pytest.fail("not needed"), calibrate=False))
     assert own.camera.fx == pytest.approx(28 / np.hypot(36, 24) * 200) and "EXIF" in own.message()
+
+
+def test_camera_of_a_video_is_that_of_a_calibration_and_never_a_model_that_does_not_exist(tmp_path: Path) -> None:
+    video, chain = open_video(write_images(tmp_path / "left", focal=28)), tmp_path / "camchain.yaml"
+
+    def one(focal: float) -> dict[str, Any]:
+        lens = {"distortion_model": "equidistant", "distortion_coeffs": [0.1, 0.02, 0.0, 0.0]}
+        return {"camera_model": "pinhole", "intrinsics": [focal, focal, 80, 60], "resolution": [160, 120], **lens}
+
+    chain.write_text(yaml.safe_dump({"left": one(90.0), "right": one(95.0)}), encoding="utf-8")
+
+    def camera(file: Path | None = None, **given: Any) -> Camera:
+        params = TrackParams.model_validate(given)
+        return video_camera(video, params, lambda: pytest.fail("not needed"), tmp_path / "lens.json", file)[0]
+
+    assert camera(chain) == Camera("fisheye", 160, 120, 90.0, 90.0, 80.0, 60.0, (0.1, 0.02, 0.0, 0.0))
+    with pytest.raises(SettingError, match="unknown model 'fisheye'.*or a file"):
+        camera(camera="fisheye", focal=500.0)
+    for name, given in {"focal": 500.0, "centre": (80.0, 60.0), "k1": 0.1, "k2": 0.0}.items():
+        with pytest.raises(SettingError, match=f"--{name}.* beside a file with the camera"):
+            camera(chain, **{name: given})
+    two = [asdict(Camera("pinhole", 160, 120, focal, focal, 80.0, 60.0)) for focal in (90.0, 95.0)]
+    assert camera(context=TrackContext(cameras=tuple(two[:1]))).fx == 90
+    with pytest.raises(InputError, match="the tile has several cameras with an image size of 160x120"):
+        camera(context=TrackContext(cameras=tuple(two)))
 
 
 @pytest.mark.parametrize("said", [None, LENS])

@@ -15,7 +15,7 @@ from scan2sim.pipeline.core.step import Params
 from scan2sim.pipeline.core.types import F64, Camera
 from scan2sim.pipeline.importers.bag import contents, images
 from scan2sim.pipeline.importers.bag.camera_topics import CameraTopics, base, rectified
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, has_only_projection, looks_rectified
+from scan2sim.pipeline.importers.bag.cameras import has_only_projection, looks_rectified
 from scan2sim.pipeline.importers.bag.clocks import check_clocks
 from scan2sim.pipeline.importers.bag.contents import Contents
 from scan2sim.pipeline.importers.bag.lidar_topics import LidarTopics
@@ -31,6 +31,7 @@ from scan2sim.pipeline.importers.bag.reader import plain
 from scan2sim.pipeline.importers.bag.transforms import BODY_FRAMES, WORLD_FRAMES, earth_centred, without_turns
 from scan2sim.pipeline.io import urdf as urdf_io
 from scan2sim.pipeline.io.calibration import read_camera
+from scan2sim.pipeline.io.camera_info import InvalidCamera, camera_of
 
 AUTO, NONE, TF, GNSS, SWEEPS = "auto", "none", "tf", "gnss", "sweeps"
 MIN_FIX_RATE_HZ, MAX_FIX_SIGMA_M = 4.0, 0.5
@@ -64,7 +65,7 @@ class BagParams(Params):
         gps: topic of a NavSatFix that is fused with lidar odometry and georeferences the world; or "none".
         world_frame: frame of the world in /tf; default: map, world or odom, else the root.
         stamps: times of messages: of their headers, or at which they were recorded.
-        transform: further static transforms, "PARENT CHILD x y z qx qy qz qw".
+        transform: static transforms, "PARENT CHILD x y z qx qy qz qw"; they replace the bag's.
         photo_interval: least time between two photos of a camera, seconds; default: all photos.
     """
 
@@ -90,7 +91,9 @@ class BagParams(Params):
         "header", description="Times of messages: header (of the sensors), or log (when they were recorded)."
     )
     transform: tuple[str, ...] = Field(
-        (), description="Static transform missing in the bag: 'PARENT CHILD x y z qx qy qz qw'; repeatable."
+        (),
+        description="Static transform missing in the bag, or instead of its own: 'PARENT CHILD x y z qx qy qz qw'; "
+        "repeatable.",
     )
     photo_interval: Seconds | None = Field(
         None, description="Least time between two photos of a camera in seconds; default: all photos."
@@ -190,7 +193,7 @@ class _Planner:
 
     def plan(self) -> Plan:
         self._add_urdf()
-        self.found.frames.add_given(self.params.transform)
+        self.warnings += self.found.frames.add_given(self.params.transform)
         lidars = self.lidars()
         scanner = lidars[0].frame
         poses = self.poses(scanner)
@@ -271,6 +274,8 @@ class _Planner:
                 key += "_2"
             camera = self._camera(topic)
             T = self.found.frames.between(frame, scanner)
+            if self.intrinsics is not None and (same := [one.topic for one in sources if one.camera == camera]):
+                self.warnings.append(f"{same[0]} and {topic} have the same camera in {self.intrinsics.name}")
             sources.append(PhotoSource(topic, key, frame, camera, T))
             self.uses[topic] = f"photos; frame {frame}, {camera.model} {camera.width}x{camera.height}"
             unused = 0 if self.found.kind(topic) == "compressed" else images.unused_bits(self.found.first[topic])
@@ -287,11 +292,12 @@ class _Planner:
     def _camera(self, topic: str) -> Camera:
         width, height = self.photos.size(topic)
         if self.intrinsics is not None:
-            return read_camera(self.intrinsics, width, height)
+            names = (_id(topic), topic, base(topic))
+            return read_camera(self.intrinsics, width, height, names=names, rectified=rectified(topic))
         info = self.photos.info(topic)
         remedy = (
-            "Give the camera with --intrinsics (a TOML file with [[cameras]] as in a tile), or choose topics with "
-            "--camera (none: no photos)"
+            "Give the camera with --intrinsics (a TOML file with [[cameras]] as in a tile, or the calibration of "
+            "another program), or choose topics with --camera (none: no photos)"
         )
         if info is None:
             infos = ", ".join(self.found.topics("info")) or "none"
@@ -485,7 +491,7 @@ def plan_import(found: Contents, params: BagParams, intrinsics: Path | None = No
     Args:
         found: contents of the bag.
         params: the user's choice.
-        intrinsics: TOML file with the cameras (`pipeline.io.calibration.read_camera`), instead of CameraInfo.
+        intrinsics: file with the cameras (`pipeline.io.calibration.read_camera`), instead of CameraInfo.
         urdf: description of the robot, whose fixed joints are added to the static transforms.
 
     Raises:

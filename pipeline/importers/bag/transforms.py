@@ -29,8 +29,12 @@ MAX_STEP_S, STEP_RATIO = 2.0, 5.0
 """A longer time without messages than both, seconds and times the usual interval, is a gap."""
 MAX_SHIFT_M, MIN_SPEED_MS = 1.0, 0.1
 """A link that changes by more than that during a gap moved; a link that is faster on average is that of a vehicle."""
+SAME_M, SAME_DEG, UNIT_TOLERANCE = 0.005, 0.2, 0.01
+"""Largest difference of equal transforms, and of a unit quaternion's length from 1."""
 MAX_LISTED = 20
 """Links that an error lists."""
+Link = tuple[str, str]
+"""Parent and child."""
 GIVE_LINK = "Give the transform with --transform 'PARENT CHILD x y z qx qy qz qw', or the robot's --urdf"
 
 
@@ -145,23 +149,47 @@ class Frames:
     static: dict[tuple[str, str], F64] = field(default_factory=dict)
     moving: dict[tuple[str, str], Series] = field(default_factory=dict)
 
-    def add_given(self, links: Iterable[str]) -> None:
-        """Add static links of the user: "PARENT CHILD x y z qx qy qz qw".
+    def add_given(self, links: Iterable[str]) -> list[str]:
+        """Add static links of the user, "PARENT CHILD x y z qx qy qz qw", instead of what the bag has between them.
+
+        Returns:
+            Warnings of links that differ from the bag's.
 
         Raises:
             SettingError: a text has another form.
         """
+        warnings = []
         for text in links:
             words = text.split()
             try:
                 parent, child, *numbers = words
                 x, y, z, *quaternion = map(float, numbers)
-                if len(quaternion) != 4:
+                if len(quaternion) != 4 or abs(np.linalg.norm(quaternion) - 1) > UNIT_TOLERANCE:
                     raise ValueError
-                self.static[plain(parent), plain(child)] = matrix((x, y, z), quaternion)
+                T, link = matrix((x, y, z), quaternion), (plain(parent), plain(child))
             except ValueError:
                 remedy = "Write 'PARENT CHILD x y z qx qy qz qw': metres, and a unit quaternion"
                 raise SettingError("--transform", f"{text!r} is not a transform", remedy) from None
+            warnings += self._replace(link, T)
+        return warnings
+
+    def _replace(self, link: Link, T: F64) -> list[str]:
+        """Set a static link, and remove those that connected the child with the parent; warn of a difference."""
+        (parent, child), warnings = link, list[str]()
+        while (known := self._connected(child).get(parent)) is not None and known[1] is not None:
+            off = np.linalg.inv(known[0]) @ T
+            shift, turn = (
+                float(np.linalg.norm(off[:3, 3])),
+                np.degrees(np.arccos(np.clip((np.trace(off) - 2) / 2, -1, 1))),
+            )
+            if shift > SAME_M or turn > SAME_DEG:
+                warnings = [
+                    f"{parent} > {child} of --transform differs by {shift:.3f} m and {turn:.1f} degrees from what the "
+                    "bag or an earlier --transform says, which isn't used"
+                ]
+            del self.static[known[1]]
+        self.static[link] = T
+        return warnings
 
     def fix_constant(self) -> None:
         """Make moving links static that have the same transform at all times."""
@@ -177,26 +205,28 @@ class Frames:
         Raises:
             InputError: no chain of static links connects them; names the frames that there are.
         """
-        T = self._static_chain(target, source)
-        if T is None:
+        found = self._connected(source).get(target)
+        if found is None:
             cause = f"has no static transform between the frames {target!r} and {source!r}; {self.listed()}"
             raise InputError(self.path, cause, f"{GIVE_LINK}, or leave out the topic in that frame")
-        return T
+        return found[0]
 
     def connected(self, target: str, source: str) -> bool:
         """Whether static links connect two frames."""
-        return self._static_chain(target, source) is not None
+        return target in self._connected(source)
 
-    def _static_chain(self, target: str, source: str) -> F64 | None:
-        reached, queue = {source: np.eye(4)}, [source]
+    def _connected(self, source: str) -> dict[str, tuple[F64, Link | None]]:
+        """Frames that static links connect with `source`: T_frame_source (4, 4), and the link next to `source`."""
+        reached, queue = dict[str, tuple[F64, Link | None]]({source: (np.eye(4), None)}), [source]
         while queue:
             frame = queue.pop(0)
+            before, first = reached[frame]
             for (parent, child), T in self.static.items():
                 for here, other, step in ((child, parent, T), (parent, child, np.linalg.inv(T))):
                     if here == frame and other not in reached:
-                        reached[other] = step @ reached[frame]
+                        reached[other] = step @ before, first or (parent, child)
                         queue.append(other)
-        return reached.get(target)
+        return reached
 
     def parents(self, frame: str) -> list[str]:
         """Parents of a frame: one in a valid tree; those with most moving transforms first."""

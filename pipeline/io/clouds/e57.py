@@ -118,7 +118,7 @@ def _points(values: dict[str, F64], coordinates: tuple[str, ...], pose: F64, nod
         intensity = _fraction(intensity, node, "intensityLimits", "intensity")
     time = values.get("timeStamp")
     if time is not None and node.isDefined("acquisitionStart/dateTimeValue"):
-        time = time + node["acquisitionStart"]["dateTimeValue"].value()
+        time = time + number_of(node["acquisitionStart"]["dateTimeValue"])
     return Points(
         xyz @ pose[:3, :3].T + pose[:3, 3],
         rgb,
@@ -133,8 +133,13 @@ def _fraction(values: F64, node: Any, limits: str, name: str) -> F64:
     """Values scaled from the scan's limits to 0..1; unchanged if it declares no limits."""
     if not node.isDefined(f"{limits}/{name}Maximum") or not node.isDefined(f"{limits}/{name}Minimum"):
         return values
-    low, high = (float(node[limits][f"{name}{end}"].value()) for end in ("Minimum", "Maximum"))
+    low, high = (number_of(node[limits][f"{name}{end}"]) for end in ("Minimum", "Maximum"))
     return (values - low) / (high - low) if high > low else values
+
+
+def number_of(node: Any) -> float:
+    """Value of a number of any type; FARO SCENE writes the limits of intensities as scaled integers."""
+    return float(node.scaledValue() if hasattr(node, "scaledValue") else node.value())
 
 
 def pose_of(node: Any) -> F64:
@@ -147,10 +152,10 @@ def pose_of(node: Any) -> F64:
 
     pose = np.eye(4)
     if node.isDefined("pose/rotation"):
-        w, x, y, z = (float(node["pose"]["rotation"][key].value()) for key in "wxyz")
+        w, x, y, z = (number_of(node["pose"]["rotation"][key]) for key in "wxyz")
         pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
     if node.isDefined("pose/translation"):
-        pose[:3, 3] = [float(node["pose"]["translation"][key].value()) for key in "xyz"]
+        pose[:3, 3] = [number_of(node["pose"]["translation"][key]) for key in "xyz"]
     if not np.isfinite(pose).all():
         raise ValueError("a pose is not finite")
     return pose

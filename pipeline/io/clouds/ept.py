@@ -76,7 +76,8 @@ def _parts(path: Path) -> Iterator[Points]:
             done += len(part)
             yield part
         if done != count:
-            raise InputError(tile, f"is truncated or damaged: {done:,} of {count:,} points can be read", REMEDY)
+            cause = f"is truncated or damaged: it has {done:,} points, the hierarchy says {count:,}"
+            raise InputError(tile, cause, REMEDY)
 
 
 def _nodes(folder: Path) -> Iterator[tuple[str, int]]:

@@ -148,7 +148,7 @@ def read(path: Path, frame: Frame) -> PointCloud:
         xyz[:at],
         None if rgb is None else _to_uint8(rgb[:at]),
         classification=classification[:at],
-        time=None if time is None or not time[:at].any() else time[:at],  # None: time fields that were never filled
+        time=None if time is None or not np.nan_to_num(time[:at]).any() else time[:at],  # None: never filled
         intensity=intensity[:at],
     )
     return cloud

@@ -24,7 +24,7 @@ from numba import njit
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
-from scan2sim.pipeline.io import file_checks, number_text, point_chunks
+from scan2sim.pipeline.io import file_checks, label_sets, number_text, point_chunks
 from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
 SUFFIXES = (".pcd",)
@@ -51,7 +51,10 @@ class _Header:
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
     """Number of finite points, low and high corner, no CRS (PCD has none), and notes."""
     found = point_chunks.summary(path, _parts(path))
-    return found.count, found.low, found.high, None, found.notes
+    with open(path, "rb") as file:
+        names = _header(path, file).row.names or ()
+    field = next((name for name in CLASSES if name in names), None)
+    return found.count, found.low, found.high, None, (*label_sets.field_notes(field), *found.notes)
 
 
 def read(path: Path, frame: Frame) -> PointCloud:

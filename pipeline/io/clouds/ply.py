@@ -164,10 +164,7 @@ def _label_notes(header: Layout) -> tuple[str, ...]:
     known, field = label_sets.matching(names), next((name for name in CLASSES if name in names), None)
     if known is not None:
         return (f"labels are read as those of {known.name}",)
-    if field is None or field.endswith("classification"):
-        return ()
-    how = "LAS classes (2 ground, 6 building, ...); map other codes from 0 to 255 with --classes"
-    return (f"field `{field}` is read as {how}",)
+    return label_sets.field_notes(field)
 
 
 def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[tuple[str, str]]]]:

@@ -206,6 +206,10 @@ def short(crs: str) -> str:
 
 def _metres_per_unit(tile: Path, crs: str) -> float:
     horizontal = _horizontal(crs)
+    if _parsed(crs).is_geocentric:
+        cause = f"its CRS {name(crs)} is geocentric (coordinates from the centre of the earth)"
+        remedy = "Reproject the clouds, for example to UTM, or name the CRS that they are in, if it is another one"
+        raise InputError(tile, cause, remedy)
     if not horizontal.is_projected:
         raise InputError(
             tile,

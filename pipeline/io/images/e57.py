@@ -214,17 +214,17 @@ def _read(
     body = node[kind]
     numbers = {}
     for key in FIELDS[kind]:
-        numbers[key] = float(body[key].value()) if body.isDefined(key) else math.nan
+        numbers[key] = e57.number_of(body[key]) if body.isDefined(key) else math.nan
         if not math.isfinite(numbers[key]) or (numbers[key] <= 0 and not key.startswith("principal")):
             raise _UnusableError(f"has no valid {key} ({numbers[key]:g})")
         if key.startswith("principal") and abs(numbers[key]) > MAX_OFFSET:
             raise _UnusableError(f"has no valid {key} ({numbers[key]:g})")
-    width, height = (int(body[key].value()) for key in ("imageWidth", "imageHeight"))
+    width, height = (int(e57.number_of(body[key])) for key in ("imageWidth", "imageHeight"))
     blob = next((key for key in BLOBS if body.isDefined(key)), None)
     if blob is None:
         raise _UnusableError(f"has no {' or '.join(BLOBS)}")
     time = "acquisitionDateTime/dateTimeValue"
-    seconds = float(node["acquisitionDateTime"]["dateTimeValue"].value()) if node.isDefined(time) else math.nan
+    seconds = e57.number_of(node["acquisitionDateTime"]["dateTimeValue"]) if node.isDefined(time) else math.nan
     axes = np.eye(4)
     axes[:3, :3] = PINHOLE_AXES if kind == PINHOLE else SPHERE_AXES
     return EmbeddedImage(

@@ -16,7 +16,7 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F32, U8
 from scan2sim.segmentation import onnx_session
 from scan2sim.segmentation.backends import torch_device
-from scan2sim.segmentation.backends.segformer import MEAN, STD, normalisation
+from scan2sim.segmentation.huggingface import MEAN, STD, numbers
 from scan2sim.services.toolboxes import drawing, models
 from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body, Class
@@ -163,8 +163,8 @@ class _OnnxNetwork:
         self.info = ModelInfo(path.stem, self._labels(metadata), onnx_session.digest(path), licence)
         height, width = (n if isinstance(n, int) and n > 0 else params.size for n in shape[2:])
         self.size = (height, width)
-        self.mean = normalisation(onnx_session.metadata_value(metadata.get("mean"), MEAN), 3, path, minimum=-np.inf)
-        self.std = normalisation(onnx_session.metadata_value(metadata.get("std"), STD), 3, path)
+        self.mean = numbers(onnx_session.metadata_value(metadata.get("mean"), MEAN), 3, path, minimum=-np.inf)
+        self.std = numbers(onnx_session.metadata_value(metadata.get("std"), STD), 3, path)
 
     def _labels(self, metadata: dict[str, str]) -> tuple[str, ...]:
         (output,) = self._session.get_outputs()

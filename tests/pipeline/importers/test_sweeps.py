@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io import trajectory as trajectory_io
 from scan2sim.pipeline.io.calibration import photo_extrinsics
 from scan2sim.pipeline.io.clouds import las
+from scan2sim.pipeline.io.rig import RigCamera, write_rig
 from scan2sim.pipeline.io.sweep_files import read_sweep
 from scan2sim.pipeline.io.tile import read_tile
 from tests.present import present
@@ -206,6 +208,44 @@ def test_points_are_coloured_by_photos_and_photos_are_posed(drive: Drive, tmp_pa
     assert np.allclose(view.T_world_cam[:3, :3], pose[:3, :3], atol=1e-6) and view.time == pytest.approx(0.3)
 
 
+def test_photos_are_posed_by_the_calibration_of_another_program(drive: Drive, tmp_path: Path) -> None:
+    """Camera and T_lidar_camera of direct_visual_lidar_calibration, with poses of the scanner."""
+    T = np.linalg.inv(T_CAMERA_SCANNER)
+    pose = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+    lens = {"camera_model": "equirectangular", "intrinsics": [512, 256], "distortion_coeffs": []}
+    calib = tmp_path / "calib.json"
+    calib.write_text(json.dumps({"camera": lens, "results": {"T_lidar_camera": pose}}), encoding="utf-8")
+    words = ["import", "sweeps", drive.folder / "sweeps", drive.folder / "scanner.kitti", "--out", tmp_path / "tile"]
+    words += ["--photos", drive.folder / "photos", "--camera", calib, "--extrinsics", calib, "--scanner-poses"]
+    result = CliRunner().invoke(app, [*map(str, words), "--pose-source", "given"])
+    assert result.exit_code == 0, result.output
+    tile, cloud, xyz = cloud_of(tmp_path / "tile")
+    right = (present(cloud.rgb) == PAINT[walls(xyz)[1]]).all(axis=1)
+    assert right[np.sort(np.abs(np.concatenate([xyz - LOW, xyz - HIGH], axis=1)), axis=1)[:, 1] > 0.5].mean() > 0.99
+    assert np.allclose(tile.views[2].T_world_cam[:3, :3], drive.camera.poses[2, :3, :3], atol=1e-6)
+    assert np.allclose(tile.frame.to_crs(tile.views[2].centre), drive.camera.positions[2], atol=1e-5)
+
+
+def test_poses_of_an_imu_place_sweeps_and_the_photos_of_a_rig(drive: Drive, tmp_path: Path) -> None:
+    """The extrinsics are T_imu_scanner; `rig.toml` has those of the camera."""
+    T_imu_scanner = np.eye(4)
+    T_imu_scanner[:3, :3], T_imu_scanner[:3, 3] = Rotation.from_rotvec([0.1, -0.2, 2.0]).as_matrix(), [0.5, -0.2, 0.9]
+    poses = scanner_path(drive.times).poses @ np.linalg.inv(T_imu_scanner)
+    trajectory_io.write(tmp_path / "imu.csv", Trajectory(drive.times, poses[:, :3, 3], poses[:, :3, :3]))
+    np.savetxt(tmp_path / "imu.txt", T_imu_scanner, "%.9f")
+    rig = tmp_path / "rig"
+    rig.mkdir()
+    (rig / "front").symlink_to(drive.folder / "photos")
+    write_rig(rig, [RigCamera("front", CAMERA, T_CAMERA_SCANNER)])
+    words = ["import", "sweeps", drive.folder / "sweeps", tmp_path / "imu.csv", "--extrinsics", tmp_path / "imu.txt"]
+    words += ["--photos", rig, "--pose-source", "given", "--out", tmp_path / "tile"]
+    result = CliRunner().invoke(app, [*map(str, words)])
+    assert result.exit_code == 0, result.output
+    tile, _, xyz = cloud_of(tmp_path / "tile")
+    assert walls(xyz)[0].max() < 0.003
+    assert np.allclose(tile.frame.to_crs(tile.views[2].centre), drive.camera.positions[2], atol=1e-5)
+
+
 def test_mask_is_imported_and_masked_pixels_give_no_colour(drive: Drive, tmp_path: Path) -> None:
     mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
     mask[128:] = 0
@@ -321,6 +361,13 @@ def test_inverted_extrinsics_are_detected(drive: Drive, tmp_path: Path) -> None:
     right = imported(**wrong, invert_extrinsics=True, out=tmp_path / "right", warn=notes.append)
     expected = cloud_of(imported(**drive.arguments, out=tmp_path / "expected"))[2]
     assert not notes and np.allclose(cloud_of(right)[2], expected, atol=2e-3)
+
+
+def test_poses_of_the_scanner_that_are_taken_for_the_cameras_are_detected(drive: Drive, tmp_path: Path) -> None:
+    notes: list[str] = []
+    scanner = drive.arguments | {"poses": drive.folder / "scanner.kitti"}
+    imported(**scanner, out=tmp_path / "tile", warn=notes.append)
+    assert any("look like the scanner's: with `--scanner-poses`" in text for text in notes)
 
 
 def test_kitti_camera_2_is_offset_from_camera_0(drive: Drive, tmp_path: Path) -> None:

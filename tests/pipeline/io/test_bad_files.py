@@ -16,7 +16,7 @@ from scan2sim.pipeline.core.cache import digest
 from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Camera, Frame, PointCloud, View
-from scan2sim.pipeline.io import clouds
+from scan2sim.pipeline.io import clouds, las_header
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.tile import read_tile
@@ -77,6 +77,16 @@ def test_las_header_must_fit_into_its_file(tmp_path: Path, suffix: str, field: s
 def test_points_beyond_the_las_header_count_are_reported(tmp_path: Path) -> None:
     path = patch(made(tmp_path / "c.las"), "count", 12)
     assert "declares 12 points, but the file has 3,000" in clouds.read_header(path).notes[0]
+
+
+def test_old_laszip_without_chunks_is_named(tmp_path: Path) -> None:
+    path = made(tmp_path / "c.laz")
+    data = bytearray(path.read_bytes())
+    record = data.index(b"laszip encoded") - 2 + las_header.VLR_HEADER_BYTES
+    data[record : record + 2], data[record + 12 : record + 16] = b"\1\0", bytes(4)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"LASzip 1, before 2011.*current LASzip"):
+        clouds.read_header(path)
 
 
 def test_points_over_a_thousand_kilometres_are_rejected(tmp_path: Path) -> None:

@@ -44,6 +44,7 @@ def test_extrinsics_are_read_from_all_file_formats(tmp_path: Path, form: str) ->
         ("1 0 0 0\n0 1 0 zero\n0 0 1 0", r"T\.txt: contains no 3x4 or 4x4 matrix"),
         ("1 0 0 0\n0 1 0 0\n0 0 -1 0", r"T\.txt: its left 3x3 is not a rotation matrix"),
         ("2 0 0 0\n0 2 0 0\n0 0 2 0", r"T\.txt: its left 3x3 is not a rotation matrix"),
+        ("1 0 0 95\n0 1 0 -410\n0 0 1 0", r"T\.txt: puts the camera 421 m from the scanner.*in metres"),
     ],
 )
 def test_invalid_extrinsics_are_rejected(tmp_path: Path, text: str, message: str) -> None:

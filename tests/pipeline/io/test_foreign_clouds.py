@@ -22,6 +22,7 @@ from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.geodata import geokeys
 from scan2sim.pipeline.io.geodata.area_of_use import misfit
+from scan2sim.pipeline.io.label_sets import parse_classes
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.steps.ingest import IngestParams, TileFrame, ingest
 from tests.pipeline.io.test_cloud_formats import ept, write_pcd
@@ -96,6 +97,26 @@ def test_a_file_of_withheld_points_only_is_refused(tmp_path: Path) -> None:
             use()
 
 
+def test_times_that_are_not_numbers_are_none(tmp_path: Path) -> None:
+    flagged(tmp_path / "c.las", 0)
+    data = laspy.read(tmp_path / "c.las")
+    data.gps_time = np.full(N, np.nan)
+    data.write(tmp_path / "c.las")
+    (tmp_path / "c.csv").write_text("x,y,z,time\n" + "1,2,3,nan\n4,5,6,nan\n", encoding="ascii")
+    for name in ("c.las", "c.csv"):
+        assert clouds.read(tmp_path / name, FRAME).time is None
+
+
+def test_node_of_an_ept_with_too_many_points_is_named(tmp_path: Path) -> None:
+    ept("laszip")(tmp_path / "ept.json", made(N))
+    node = tmp_path / "ept-data" / "0-0-0-0.laz"
+    points = laspy.read(node)
+    points.points = points.points[np.arange(len(points)).repeat(2)]
+    points.write(node)
+    with pytest.raises(InputError, match=r"0-0-0-0\.laz: .*it has [\d,]+ points, the hierarchy says"):
+        clouds.read_header(tmp_path / "ept.json")
+
+
 def test_withheld_points_of_an_ept_are_not_used(tmp_path: Path) -> None:
     ept("laszip")(tmp_path / "ept.json", made(N))
     for file in (tmp_path / "ept-data").iterdir():
@@ -150,6 +171,31 @@ def test_intensities_are_scaled_by_scan(tmp_path: Path) -> None:
     write_scans(tmp_path / "c.e57", [{"intensity": levels}, {"intensity": levels * 1000}], ranges)
     intensity = present(clouds.read(tmp_path / "c.e57", Frame()).intensity).reshape(2, 1000)
     assert np.abs(intensity[0].astype(int) - intensity[1]).max() <= 1 and intensity.max() == 65535
+
+
+def test_limits_of_an_e57_may_be_scaled_integers(tmp_path: Path) -> None:
+    """FARO SCENE writes those of intensities so."""
+    pye57 = pytest.importorskip("pye57", reason="E57 files are written by pye57")
+    libe57, file = pye57.libe57, pye57.E57(str(tmp_path / "c.e57"), mode="w")
+    levels = np.linspace(0, 500, 1000)
+    values = {name: levels.copy() for name in ("cartesianX", "cartesianY", "cartesianZ", "intensity")}
+    owner, buffers = file.image_file, libe57.VectorSourceDestBuffer()
+    scan, limits, point = (libe57.StructureNode(owner) for _ in range(3))
+    for name, column in values.items():
+        point.set(name, libe57.FloatNode(owner, 0.0))
+        buffers.append(libe57.SourceDestBuffer(owner, name, column, 1000, True, True))
+    for end, raw in (("Minimum", 0), ("Maximum", 10_000)):
+        limits.set(f"intensity{end}", libe57.ScaledIntegerNode(owner, raw, 0, 10_000, 0.1, 0.0))
+    points = libe57.CompressedVectorNode(owner, point, libe57.VectorNode(owner, True))
+    for name, node in (("guid", libe57.StringNode(owner, "{scan}")), ("intensityLimits", limits), ("points", points)):
+        scan.set(name, node)
+    file.data3d.append(scan)
+    writer = points.writer(buffers)
+    writer.write(1000)
+    writer.close()
+    file.close()
+    intensity = present(clouds.read(tmp_path / "c.e57", Frame()).intensity)
+    assert np.abs(intensity - 65535 / 1000 * levels).max() <= 1
 
 
 def test_a_tile_has_the_attributes_of_all_clouds(tmp_path: Path) -> None:
@@ -504,6 +550,9 @@ def labelled(path: Path, fields: str, label: str, labels: np.ndarray) -> Path:
          {0: "unclassified", 1: "road", 4: "building", 6: "pole", 7: "vehicle"}),
         ("x_origin y_origin z_origin reflectance", "class", "Paris-Lille-3D",
          {0: "unclassified", 1: "terrain", 2: "building", 8: "vehicle", 9: "high_vegetation"}),
+        ("red green blue instance visible confidence", "semantic", "KITTI-360",
+         {0: "unclassified", 5: "unclassified", 7: "road", 8: "sidewalk", 11: "building", 17: "pole", 20: "road_sign",
+          21: "high_vegetation", 22: "terrain", 26: "vehicle", 35: "wall_or_fence", -1: "unclassified"}),
     ],
 )  # fmt: skip
 def test_labels_of_data_sets_are_mapped(
@@ -522,3 +571,49 @@ def test_labels_that_are_no_las_codes_are_unclassified_and_counted(tmp_path: Pat
     assert any("field `label` is read as LAS classes" in note for note in notes)
     assert any("1,500 points have classes that are no LAS codes" in note for note in notes)
     assert present(clouds.read(path, Frame()).classification)[:4].tolist() == [2, 6, 1, 1]
+
+
+def test_labels_of_a_pcd_are_noted(tmp_path: Path) -> None:
+    """PCL's labels are often those of segments."""
+    head = "FIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n"
+    (tmp_path / "c.pcd").write_text(head + "0 0 0 1\n1 1 1 2\n", encoding="ascii")
+    assert any("field `label` is read as LAS classes" in note for note in clouds.read_header(tmp_path / "c.pcd").notes)
+
+
+def test_points_of_a_ply_may_end_with_their_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recwarn: pytest.WarningsRecorder
+) -> None:
+    """A mesh without faces, or whose faces are in the next block: no warning of numpy appears."""
+    head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+    points = "0 0 0\n1 1 1\n"
+    (tmp_path / "c.ply").write_text(f"{head}element note 1\nproperty int n\nend_header\n{points}7\n", encoding="ascii")
+    monkeypatch.setattr("scan2sim.pipeline.io.number_text.BLOCK_BYTES", len(points))
+    assert clouds.read_header(tmp_path / "c.ply").count == 2
+    assert not recwarn.list
+
+
+def test_labels_of_a_named_data_set_are_mapped(tmp_path: Path) -> None:
+    """SemanticKITTI's 10 is a car, not LAS's rail; 11 a bicycle, not a road; codes that it doesn't have, no class."""
+    labels = np.resize([40, 48, 50, 70, 72, 80, 81, 10, 11, 18, 30, 99, 252], N)
+    path = labelled(tmp_path / "c.ply", "a", "label", labels)
+    _, warnings = ingested(tmp_path / "plain", [path], Frame())
+    assert any(
+        "They seem to be labels of SemanticKITTI: import with --classes SemanticKITTI" in one for one in warnings
+    )
+    table = clouds.code_table(path, parse_classes("semantickitti"))
+    expected = [
+        "road", "sidewalk", "building", "high_vegetation", "terrain", "pole", "road_sign", "vehicle", "vehicle",
+        "vehicle", "person", "unclassified", "vehicle", "unclassified",
+    ]  # fmt: skip
+    assert table[[*labels[:13], 2]].tolist() == [CODE[name] for name in expected]
+    assert parse_classes("65=noise") == {65: CODE["low_noise"]} and parse_classes("") == {}
+    with pytest.raises(SettingError, match="'KITTI' is no known data set.*KITTI-360, SemanticKITTI"):
+        parse_classes("KITTI")
+    dales = clouds.code_table(path, parse_classes("DALES"))[[1, 2, 8, 11]]
+    assert dales.tolist() == [CODE[name] for name in ("terrain", "high_vegetation", "building", "unclassified")]
+
+
+def test_codes_of_a_survey_are_not_taken_for_a_data_set(tmp_path: Path) -> None:
+    path = labelled(tmp_path / "c.ply", "a", "label", np.resize([2, 5, 6, 70, 71], N))
+    _, warnings = ingested(tmp_path / "plain", [path], Frame())
+    assert any("survey's own" in one for one in warnings) and not any("SemanticKITTI" in one for one in warnings)

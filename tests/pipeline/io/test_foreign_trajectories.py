@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
+from scan2sim.flows.cli import app
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io import trajectory
@@ -88,6 +90,28 @@ def test_every_file_has_the_same_poses(tmp_path: Path, name: str) -> None:
     assert len(found) == COUNT and found.times == pytest.approx(NS / 1e9, abs=1e-6)
     assert np.allclose(found.positions, POSITIONS)
     assert found.rotations is not None and np.allclose(found.rotations, ROTATIONS.as_matrix(), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_inspect_recognizes_a_trajectory(tmp_path: Path, name: str) -> None:
+    file, text = FILES[name]
+    (tmp_path / file).write_text(text, encoding="utf-8")
+    shown = CliRunner().invoke(app, ["inspect", str(tmp_path / file)])
+    assert shown.exit_code == 0, shown.output
+    for expected in ("trajectory:", "20.0 Hz", "import sweeps"):
+        assert expected in " ".join(shown.output.split())
+
+
+def test_inspect_reports_poses_without_times(tmp_path: Path) -> None:
+    (tmp_path / "00.txt").write_text(lines(MATRICES, separator=" "), encoding="utf-8")
+    shown = CliRunner().invoke(app, ["inspect", str(tmp_path / "00.txt")])
+    assert shown.exit_code == 0 and "none: 10 poses per second are assumed" in shown.output
+
+
+@pytest.mark.parametrize("header", ["x,y,z,r,g,b,intensity,time", "time,x,y,z,r,g,b,class", "x,y,z,nx,ny,nz,r,g", ""])
+def test_a_cloud_is_no_trajectory(tmp_path: Path, header: str) -> None:
+    (tmp_path / "a.csv").write_text(header + "\n" + "1,2,3,4,5,6,7,8\n" * 9, encoding="utf-8")
+    assert not trajectory.is_trajectory(tmp_path / "a.csv")
 
 
 def test_poses_of_a_standing_vehicle_are_kept_without_times(tmp_path: Path) -> None:

@@ -93,8 +93,52 @@ def test_missing_image_is_reported_and_leaves_its_faces_uncoloured(tmp_path: Pat
 def test_missing_material_file_is_reported(tmp_path: Path) -> None:
     path = obj(tmp_path)
     (tmp_path / "m.mtl").unlink()
-    _, notes = read(path)
+    mesh, notes = read(path)
     assert "m.mtl" in notes[0]
+    assert not mesh.coloured.any()
+
+
+PLY = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+property float s
+property float t
+{names}element face 1
+property list uchar uint vertex_indices
+end_header
+0 0 0 0 0{a}
+1 0 0 1 0{b}
+1 1 0 1 1{a}
+0 1 0 0 1{b}
+4 0 1 2 3
+"""
+"""A square as Blender writes it: texture coordinates, and no image."""
+
+
+def test_texture_coordinates_without_an_image_are_no_colours(tmp_path: Path) -> None:
+    (tmp_path / "m.obj").write_text(SQUARE + FACES, encoding="utf-8")
+    (tmp_path / "m.ply").write_text(PLY.format(names="", a="", b=""), encoding="utf-8")
+    for name in ("m.obj", "m.ply"):
+        mesh, _ = read(tmp_path / name)
+        assert not mesh.coloured.any() and not mesh.images
+
+
+@pytest.mark.parametrize("material", ["", "mtllib m.mtl\nusemtl a\n"])
+def test_colours_of_vertices_beside_texture_coordinates_are_used(tmp_path: Path, material: str) -> None:
+    """MeshLab and Blender write both, without an image."""
+    names = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    (tmp_path / "m.ply").write_text(PLY.format(names=names, a=" 200 0 100", b=" 0 50 100"), encoding="utf-8")
+    (tmp_path / "m.mtl").write_text("newmtl a\nKd 0.2 0.2 0.2\n", encoding="utf-8")
+    ends = " 0.8 0 0.4", " 0 0.2 0.4"
+    corners = [line + (ends[i % 2] if i < 4 else "") for i, line in enumerate(SQUARE.splitlines())]
+    (tmp_path / "m.obj").write_text(material + "\n".join(corners) + "\n" + FACES, encoding="utf-8")
+    for name, expected in (("m.ply", (200, 0, 100)), ("m.obj", (204, 0, 102))):
+        mesh, _ = read(tmp_path / name)
+        assert mesh.coloured.all() and np.abs(mesh.colour.reshape(-1, 3) - expected).min(axis=0).max() <= 1
+        assert np.ptp(mesh.colour[..., 0]) >= 200
 
 
 def test_damaged_image_is_reported(tmp_path: Path) -> None:

@@ -114,6 +114,7 @@ def test_tile_round_trip(tmp_path: Path) -> None:
         ({"units": "yards"}, r"field `units`.*docs/reference/formats\.md"),
         ({"crs": "EPSG:99999"}, r"EPSG:99999.* is not a valid CRS.*EPSG:32633"),
         ({"crs": "EPSG:4326", "clouds": ["bare.laz"]}, r"is not projected.*UTM"),
+        ({"crs": "EPSG:4978", "clouds": ["bare.laz"]}, r"is geocentric.*UTM, or name"),
         ({"clouds": ["none.laz"]}, r"none\.laz: file not found.*Check the path"),
         ({"clouds": ["bare.laz"]}, r'bare\.laz: has no CRS, and neither has the tile.*crs = "local"'),
         ({"clouds": ["cloud.laz", "lambert.laz"]}, r"lambert\.laz: is in EPSG:2154, but cloud\.laz is in EPSG:32632"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.core.types import F64, Camera, Frame, PointCloud, View
+from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, PointCloud, View
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.tile import read_tile
 from scan2sim.pipeline.plausibility import check
@@ -30,12 +30,14 @@ def street(seed: int = 0, count: int = 60_000) -> F64:
     return xyz + random.normal(0, 0.005, xyz.shape) + ORIGIN
 
 
-def write(folder: Path, xyz: F64) -> Path:
-    """A tile of the points."""
+def write(folder: Path, xyz: F64, classification: U8 | None = None, classes: str = "") -> Path:
+    """A tile of the points, with codes (N,) and the entries of `[classes]`."""
     frame = Frame("EPSG:32633", tuple(np.floor(xyz.mean(axis=0)).tolist()))
     folder.mkdir(exist_ok=True)
-    las.write(folder / "cloud.laz", PointCloud(frame, (xyz - frame.origin).astype(np.float32)))
-    (folder / "tile.toml").write_text('name = "street"\nclouds = ["cloud.laz"]\n', encoding="utf-8")
+    local = (xyz - frame.origin).astype(np.float32)
+    las.write(folder / "cloud.laz", PointCloud(frame, local, classification=classification))
+    text = f'name = "street"\nclouds = ["cloud.laz"]\n[classes]\n{classes}'
+    (folder / "tile.toml").write_text(text, encoding="utf-8")
     return folder / "tile.toml"
 
 
@@ -114,3 +116,27 @@ def test_the_worst_finding_comes_first_and_a_failed_check_costs_nothing(
 
     monkeypatch.setattr(check, "sample_points", fail)
     assert check_tile(path) == ["the plausibility of the tile couldn't be checked (MemoryError: no more)"]
+
+
+@pytest.mark.parametrize(
+    ("ground", "wall", "classes", "wrong"),
+    [
+        (2, 6, "", False),
+        (11, 6, "", False),
+        (1, 2, "", True),  # Paris-Lille-3D: 1 ground, 2 building
+        (1, 8, "", True),  # DALES: 8 building
+        (7, 11, "", True),  # Cityscapes: 7 road, 11 building
+        (7, 11, '7 = "road"\n11 = "building"\n', False),
+        (2, 2, "", False),  # a cliff is ground
+        (1, 6, "", False),  # only buildings are classified
+    ],
+)
+def test_codes_of_other_data_sets_are_reported(
+    tmp_path: Path, ground: int, wall: int, classes: str, wrong: bool
+) -> None:
+    """Of `street`, every other point is ground."""
+    codes = np.where(np.arange(60_000) % 4 < 2, ground, wall).astype(np.uint8)
+    found = check_tile(write(tmp_path / "tile", street(), codes, classes))
+    assert len(found) == wrong
+    if wrong:
+        assert found[0].startswith("100% of the classified points more than 4 m above") and "--classes" in found[0]

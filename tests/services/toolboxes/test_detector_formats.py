@@ -274,6 +274,13 @@ def test_class_names_of_a_text_file_are_used(tmp_path: Path) -> None:
     assert [one.label for one in body.detections or ()] == ["barrier"]
 
 
+def test_class_names_of_hugging_faces_config_are_used(tmp_path: Path) -> None:
+    path = write(tmp_path / "mine.onnx", {"output0": yolov8(2, 1)})
+    (tmp_path / "config.json").write_text('{"id2label": {"0": "tram", "1": "barrier"}}', encoding="utf-8")
+    (body,) = detect.load(Params(weights=path))([np.zeros(IMAGE_SHAPE, np.uint8)])
+    assert [one.label for one in body.detections or ()] == ["barrier"]
+
+
 def test_error_on_missing_class_names_names_their_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"labels\.txt"):
         detect.load(Params(weights=write(tmp_path / "mine.onnx", {"output0": yolov8(2, 1)})))

@@ -45,7 +45,7 @@ def test_field_of_view_gives_a_pinhole_camera_and_its_camera_info() -> None:
         ({"d": np.ones(12)}, "12 coefficients"),
         ({"d": np.array([0.1, math.nan])}, "coefficients"),
         ({"d": np.array([1e300, 0.0, 0.0, 0.0])}, "distortion"),
-        ({"distortion_model": "double_sphere"}, "unknown distortion model 'double_sphere'"),
+        ({"distortion_model": "double_sphere"}, "'double_sphere' (the double sphere model)"),
         ({"k": np.zeros(9)}, "not calibrated"),
         ({"k": np.full(9, math.nan)}, "not calibrated"),
         ({"k": np.array([1e9, 0, 31.5, 0, 1e9, 23.5, 0, 0, 1]), "d": np.zeros(5)}, "focal lengths"),

@@ -150,6 +150,10 @@ def test_given_sources_are_fused_and_reported(tmp_path: Path) -> None:
     path, summary = placed(files, tmp_path / "out", "matched", "poses", "extrinsics")
     assert summary == "placed by sweeps (85 % of the motions), trajectory (87 % of the motions)"
     assert error(path).max() < 5 and ate(path.positions, truth, scaled=False) < 1
+    np.savetxt(tmp_path / "inverse.txt", inverse(drive.T_camera_scanner)[:3], "%.9f")
+    inverted = files | {"extrinsics": tmp_path / "inverse.txt"}
+    same, _ = placed(inverted, tmp_path / "inverted", "matched", "poses", "extrinsics", invert_extrinsics=True)
+    assert np.allclose(same.positions, path.positions, atol=1e-4)
     everything = ("matched", "poses", "extrinsics", "gps")
     path, summary = placed(files, tmp_path / "out", *everything, gps_offset=-100.0)
     places = re.search(r"GPS \((\d+) of 400 positions\)", summary)

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from scan2sim.pipeline.camera.models import project
-from scan2sim.pipeline.importers.bag.cameras import InvalidCamera, camera_of, has_only_projection, looks_rectified
+from scan2sim.pipeline.importers.bag.cameras import has_only_projection, looks_rectified
 from scan2sim.pipeline.importers.bag.images import InvalidImage, compressed_file, raw_file
+from scan2sim.pipeline.io.camera_info import camera_of
+from tests.pipeline.io.test_camera_info import info
 
 RGB = np.zeros((16, 24, 3), np.uint8)
 RGB[:8, :, 0], RGB[8:, :, 1], RGB[:, 12:, 2] = 200, 120, 90
@@ -101,40 +102,6 @@ def test_compressed_bayer_patterns_are_demosaiced(suffix: str, codec: str) -> No
         assert compressed_file(SimpleNamespace(data=content, format=converted)) == (suffix, content)
 
 
-def info(model: str, D: list[float], **more: Any) -> Any:
-    """A CameraInfo of ROS 2."""
-    roi = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
-    P = [350.0, 0, 330, 0, 0, 350, 250, 0, 0, 0, 1, 0]
-    body = {"d": D, "k": [400.0, 0, 320, 0, 410, 240, 0, 0, 1], "p": P, "distortion_model": model, "roi": roi}
-    return SimpleNamespace(**({"width": 640, "height": 480, "binning_x": 0, "binning_y": 0} | body | more))
-
-
-@pytest.mark.parametrize(
-    ("model", "D"),
-    [
-        ("plumb_bob", [-0.2, 0.05, 1e-3, -2e-3, 0.01]),
-        ("rational_polynomial", [0.3, -0.1, 1e-3, 2e-3, 0.01, 0.5, -0.05, 0.02]),
-        ("equidistant", [0.02, -0.01, 3e-3, -1e-3]),
-    ],
-)
-def test_distortion_models_project_like_opencv(model: str, D: list[float]) -> None:
-    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (50, 3))
-    K = np.array([[400.0, 0, 320], [0, 410, 240], [0, 0, 1]])
-    if model == "equidistant":
-        expected = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), K, np.array(D))[0]
-    else:
-        expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(D))[0]
-    uv, valid = project(camera_of(info(model, D), rectified=False), points)
-    assert valid.all() and np.allclose(uv, expected.reshape(-1, 2), atol=1e-3)
-
-
-def test_rectified_images_have_the_intrinsics_of_p() -> None:
-    camera = camera_of(info("plumb_bob", [-0.2, 0.05, 0, 0, 0]), rectified=True)
-    assert (camera.model, camera.fx, camera.cx, camera.distortion) == ("pinhole", 350, 330, ())
-    plain = camera_of(info("plumb_bob", [0.0] * 5), rectified=False)
-    assert (plain.model, plain.fx, plain.cy) == ("pinhole", 400, 240)
-
-
 def test_camera_without_k_has_that_of_p() -> None:
     without = info("", [], k=[0.0] * 9)
     assert has_only_projection(without) and not has_only_projection(info("", []))
@@ -149,22 +116,3 @@ def test_rectified_images_with_raw_intrinsics_are_recognized() -> None:
     assert looks_rectified(info("plumb_bob", D, k=K, p=P, **size))
     assert not looks_rectified(info("plumb_bob", D, k=K, p=P, width=1392, height=512))
     assert not looks_rectified(info("plumb_bob", [0.0] * 5, k=P[:3] + P[4:7] + P[8:11], p=P, **size))
-
-
-def test_intrinsics_follow_binning_and_region_of_interest() -> None:
-    roi = SimpleNamespace(x_offset=100, y_offset=60, width=400, height=300)
-    camera = camera_of(info("plumb_bob", [0.0] * 5, roi=roi, binning_x=2, binning_y=2), rectified=False)
-    assert (camera.width, camera.height, camera.fx, camera.cx) == (200, 150, 200, (220 + 0.5) / 2 - 0.5)
-
-
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        (info("plumb_bob", [], k=[0.0] * 9, p=[0.0] * 12), "is not calibrated"),
-        (info("thin_prism", [0.1]), "unknown distortion model 'thin_prism'"),
-        (info("plumb_bob", [0.1] * 12), "has 12 coefficients"),
-    ],
-)
-def test_unusable_cameras_are_rejected(bad: Any, message: str) -> None:
-    with pytest.raises(InvalidCamera, match=message):
-        camera_of(bad, rectified=False)

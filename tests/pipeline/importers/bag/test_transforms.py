@@ -39,9 +39,28 @@ def test_missing_transform_is_reported_with_its_frames_and_can_be_given() -> Non
         frames.between("cam", "lidar")
     frames.add_given(["base cam 5 0 0 0 0 0 1"])
     assert np.allclose(frames.between("cam", "lidar"), pose(-4))
-    for text in ("base cam 1 2 3", "base cam 1 2 3 0 0 0 0", "base cam 1 2 3 a b c d"):
+    for text in ("base cam 1 2 3", "base cam 1 2 3 0 0 0 0", "base cam 1 2 3 0 0 0 45", "base cam 1 2 3 a b c d"):
         with pytest.raises(SettingError, match="is not a transform"):
             frames.add_given([text])
+
+
+@pytest.mark.parametrize(
+    "links",
+    [
+        {("lidar", "cam"): pose(9)},
+        {("cam", "lidar"): pose(9)},
+        {("base", "lidar"): pose(1), ("base", "cam"): pose(9)},
+        {("base", "lidar"): pose(1), ("base", "rig"): pose(0), ("rig", "cam"): pose(9), ("lidar", "cam"): pose(9)},
+    ],
+)
+def test_given_transform_replaces_that_of_the_bag_however_it_is_connected(links: dict[tuple[str, str], F64]) -> None:
+    frames = Frames(Path("drive.mcap"), {**links, ("cam", "optical"): pose(0.5)})
+    (warning,) = frames.add_given(["lidar cam 3 0 0 0 0 0 1"])
+    assert "lidar > cam of --transform differs by" in warning and "which isn't used" in warning
+    assert np.allclose(frames.between("lidar", "cam"), pose(3))
+    assert np.allclose(frames.between("lidar", "optical"), pose(3.5))
+    assert frames.add_given(["lidar cam 3 0 0 0 0 0 1"]) == []
+    assert ("base", "lidar") not in links or frames.connected("base", "lidar")
 
 
 def test_poses_are_chained_from_moving_transforms() -> None:

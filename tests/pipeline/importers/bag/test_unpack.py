@@ -27,6 +27,7 @@ from scan2sim.pipeline.io.rig import read_rig
 from scan2sim.pipeline.io.sweep_files import list_files, read_sweep
 from scan2sim.pipeline.io.urdf import read_fixed_joints
 from tests.fakes.bags import FORMATS, BagFile, bag_file, bag_path, records
+from tests.present import present
 
 START, SWEEPS, PERIOD = 1_700_000_000.0, 8, 0.1
 CAMERA = Camera("opencv", 40, 30, 35.0, 36.0, 19.0, 14.0, (-0.1, 0.02, 1e-3, 2e-3))
@@ -89,7 +90,8 @@ def unpacked(path: Path, out: Path, **params: Any) -> tuple[Unpacked, list[str]]
     """The files of a bag, and the warnings."""
     notes: list[str] = []
     out.mkdir(exist_ok=True)
-    return unpack(path, out, BagParams(**params), warn=notes.append), notes
+    beside = {name: params.pop(name, None) for name in ("intrinsics", "urdf")}
+    return unpack(path, out, BagParams(**params), warn=notes.append, **beside), notes
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -495,6 +497,29 @@ def test_missing_camera_transform_is_reported_and_can_be_given(tmp_path: Path) -
     links = ("base lidar 0 0 0 0 0 0 1", "lidar camera 0 0 1 0 0 0 1")
     found, _ = unpacked(path, tmp_path / "b", transform=links)
     assert found.photos is not None and read_rig(found.photos)[0].T_camera_scanner[2, 3] == -1
+
+
+def test_each_topic_gets_its_camera_of_a_chain_of_kalibr(tmp_path: Path) -> None:
+    def stereo(bag: BagFile, k: int, time: float) -> None:
+        for side in ("left", "right"):
+            bag.image(f"/{side}/image_raw", time, "camera", photo(k), "rgb8")
+
+    def one(side: str, focal: float) -> str:
+        return (
+            f"{{camera_model: pinhole, intrinsics: [{focal}, {focal}, 19, 14], distortion_model: radtan, "
+            f"distortion_coeffs: [-0.1, 0.02, 0.001, 0.002], resolution: [40, 30], rostopic: /{side}/image_raw}}\n"
+        )
+
+    path, chain = write(tmp_path / "bag", "mcap", tf, points, stereo), tmp_path / "camchain.yaml"
+    chain.write_text(f"cam0: {one('left', 35)}cam1: {one('right', 36)}", encoding="utf-8")
+    topics = {"intrinsics": chain, "camera": ("/left/image_raw", "/right/image_raw")}
+    found, notes = unpacked(path, tmp_path / "a", **topics)
+    lenses = {one.id: one.camera for one in read_rig(present(found.photos))}
+    assert notes == [] and (lenses["left"].fx, lenses["right"].fx) == (35, 36)
+    assert lenses["left"].distortion == CAMERA.distortion
+    chain.write_text(f"cam0: {one('left', 35)}", encoding="utf-8")
+    _, notes = unpacked(path, tmp_path / "b", **topics)
+    assert "/left/image_raw and /right/image_raw have the same camera in camchain.yaml" in notes
 
 
 def truncated(path: Path, share: float) -> None:
