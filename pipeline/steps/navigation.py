@@ -20,6 +20,9 @@ from scan2sim.pipeline.simulation import ground_origin
 MAX_CLOUD_POINTS = 10_000_000
 BLOCK_M = 0.5
 """Points are queried block by block: neighbours use the same part of the search tree, which is four times as fast."""
+NEAR_M = 0.5
+"""Surfaces farther than this from all points, such as floors under furniture, get the median intensity: a search for
+their nearest points took most of the step's time."""
 INTENSITY_SCALE = 257.0
 """Intensities of clouds (16 bits) per level of the PCD's, which are 0 to 255."""
 FOLDER_FILE = "navigation.json"
@@ -79,8 +82,9 @@ def navigation(inputs: Inputs, params: NavigationParams, out: Path, report: Repo
     """Write occupancy maps of the `collision` mesh, a spawn pose, and points of the visual meshes (`mesh.CLASS`).
 
     The robot starts where the `path` begins, or else at the origin of its map. Intensities are those of the nearest
-    points of `cloud` (optional). File: `navigation`, a folder with `map.yaml` and `map.pgm` (the storey of the start;
-    others: `map_1` ...), `map.pcd` (only for robots' maps, in the map's frame and unit), and `navigation.json`.
+    points of `cloud` (optional), or its median where none is near. File: `navigation`, a folder with `map.yaml` and
+    `map.pgm` (the storey of the start; others: `map_1` ...), `map.pcd` (only for robots' maps, in the map's frame and
+    unit), and `navigation.json`.
 
     Without a floor that a robot fits on there are no maps and no pose, and a warning.
 
@@ -192,7 +196,7 @@ def _write_points(inputs: Inputs, context: NavigationContext, path: Path) -> int
 
 
 def _intensity(inputs: Inputs, xyz: F32) -> F32 | None:
-    """(N,) intensities 0 to 255 of the nearest points of the cloud, if it has any."""
+    """(N,) intensities 0 to 255 of the nearest points of the cloud, if it has any; the median where none is near."""
     from scipy.spatial import cKDTree
 
     cloud = PointCloud.load(inputs["cloud"]) if "cloud" in inputs else None
@@ -200,8 +204,9 @@ def _intensity(inputs: Inputs, xyz: F32) -> F32 | None:
         return None
     order = np.lexsort(np.floor(xyz / BLOCK_M).T)
     nearest = np.empty(len(xyz), np.int64)
-    nearest[order] = cKDTree(cloud.xyz).query(xyz[order], workers=-1)[1]
-    return (cloud.intensity[nearest] / INTENSITY_SCALE).astype(np.float32)
+    nearest[order] = cKDTree(cloud.xyz).query(xyz[order], distance_upper_bound=NEAR_M, workers=-1)[1]
+    known = np.append(cloud.intensity, np.median(cloud.intensity))  # the last: no point is near
+    return (known[nearest] / INTENSITY_SCALE).astype(np.float32)
 
 
-NAVIGATION = Step("navigation", 4, navigation, NavigationParams)
+NAVIGATION = Step("navigation", 5, navigation, NavigationParams)

@@ -17,7 +17,7 @@ from scan2sim.data_samples.building import Style, build
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, Frame, Mesh, PointCloud
-from scan2sim.pipeline.geometry.surface_distance import distances
+from scan2sim.pipeline.geometry.surface_distance import distances, sample_surface
 from scan2sim.pipeline.io import clouds, world_formats
 from scan2sim.pipeline.io.navigation import nav2_map, pcd
 from scan2sim.pipeline.io.world_formats import SceneParams
@@ -75,6 +75,10 @@ def test_pcd_round_trip_in_single_and_double_precision(tmp_path: Path) -> None:
     assert np.abs(far.xyz - xyz).max() < 1e-4 and far.intensity is None
 
 
+def middle(mesh: Mesh) -> np.ndarray:
+    return (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+
+
 @pytest.fixture(scope="module")
 def step(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Mesh]:
     """The step's folder for a building that was mapped in millimetres, y up and tilted; and its mesh in the world."""
@@ -84,8 +88,10 @@ def step(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Mesh]:
     world = Mesh(Frame(), (building.mesh.vertices - start).astype(np.float32), building.mesh.faces)
     mesh = world.moved_to(Frame(origin=ORIGIN))
     mesh.save(folder / "mesh.npz")
-    seen = PointCloud(mesh.frame, mesh.vertices, intensity=np.full(len(mesh.vertices), 257 * 100, np.uint16))
-    seen.save(folder / "cloud.npz")
+    points = sample_surface(mesh, 40_000)
+    at = points + np.asarray(ORIGIN) - middle(world)
+    seen = PointCloud(mesh.frame, points, intensity=(257 * np.where(at[:, 1] < 1, 50, 200)).astype(np.uint16))
+    seen.take(at[:, 0] < 0).save(folder / "cloud.npz")  # half of the building
     context = {
         "world_origin": (0.0, 0.0, 0.0), "T_world_map": tuple(map(tuple, turned().tolist())), "unit": 0.001,
         "spacing": 0.1,
@@ -103,7 +109,13 @@ def test_points_in_the_frame_and_unit_of_the_map_lie_on_the_world(step: tuple[Pa
     placed = 0.001 * cloud.xyz.astype(np.float64) @ turned()[:3, :3].T
     assert distances(placed.astype(np.float32), world).max() < 0.002
     assert len(cloud) == pytest.approx(world.face_area.sum() / 0.01, rel=0.01)
-    assert cloud.intensity is not None and (cloud.intensity == cloud.intensity[0]).all()
+    assert cloud.intensity is not None
+    at = placed - middle(world)
+    seen, left, right = at[:, 0] < -0.5, at[:, 1] < 0.5, at[:, 1] > 1.5
+    level = cloud.intensity / 257
+    assert (level[seen & left] == 50).all() and (level[seen & right] == 200).all()
+    assert (level[at[:, 0] > 0.6] == 50).all()  # no point is near: the median
+    assert (seen & right).sum() > 1000 < (at[:, 0] > 0.6).sum()
 
 
 def test_map_and_spawn_pose_are_in_world_coordinates(step: tuple[Path, Mesh]) -> None:
