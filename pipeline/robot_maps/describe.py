@@ -17,6 +17,12 @@ MILLIMETRE_MIN_SPACING = 3.0
 MILLIMETRE_MIN_HEIGHT = 500.0
 """Spacing and smallest extent from which coordinates are millimetres: no map in metres is so thin and so high."""
 PLANE_NEIGHBOURS = 12
+NOISE_SAMPLES, NOISE_NEIGHBOURS = 2_000, 25
+NOISE_THINNING = (1, 4, 16, 64, 256)
+"""Noise is measured in neighbourhoods of every n-th point that are several times as wide as it: n for each sample is
+the smallest of these at which variance across the plane is at most `NOISE_MAX_RATIO` of that along it."""
+NOISE_MAX_RATIO, NOISE_MAX_WIDTH_M = 0.04, 0.5
+"""Of wider ones (standard deviation along the plane), the shape of the ground would count as noise."""
 PLAN_CELL_M = 0.5
 """Cell of the raster in plan view in which heights are compared."""
 CEILING_HEIGHT_M = (1.8, 6.0)
@@ -39,7 +45,7 @@ class MapDescription:
 
     Attributes:
         spacing: median over points of the mean distance to six neighbours, on the scale of a square lattice.
-        noise: median distance of points from the plane through their neighbours.
+        noise: median over points of the standard deviation around the plane through their neighbours; 0: none is flat.
         level_share, upright_share: shares of points whose normals are vertical and horizontal.
         ceiling_share: share of the columns in plan view with a ceiling.
         enclosed_share: share of the directions around the sensor's start that a wall closes.
@@ -68,12 +74,12 @@ def describe(xyz: F32, start: F64) -> MapDescription:
         xyz: (N, 3) metres, z up, without outliers.
         start: (3,) position of the sensor at its start, in the same axes.
     """
-    normal_z, noise, spacing = _surfaces(xyz)
+    normal_z, spacing = _surfaces(xyz)
     level, upright = float((normal_z > LEVEL_MIN_NORMAL_Z).mean()), float((normal_z < UPRIGHT_MAX_NORMAL_Z).mean())
     ceiling, enclosed = _ceiling_share(xyz), _enclosed_share(xyz, start)
     indoor = ceiling > INDOOR_MIN_CEILING_SHARE or enclosed > INDOOR_MIN_ENCLOSED_SHARE
     scene: Scene = "indoor" if indoor else "outdoor"
-    return MapDescription(spacing, noise, level, upright, ceiling, enclosed, scene)
+    return MapDescription(spacing, _noise(xyz), level, upright, ceiling, enclosed, scene)
 
 
 def _enclosed_share(xyz: F32, start: F64) -> float:
@@ -87,20 +93,43 @@ def _enclosed_share(xyz: F32, start: F64) -> float:
     return float((count > SECTOR_MIN_POINTS).mean())
 
 
-def _surfaces(xyz: F32) -> tuple[F32, float, float]:
-    """|z| of the normals of sampled points, their median distance from the plane through their neighbours; spacing."""
+def _surfaces(xyz: F32) -> tuple[F32, float]:
+    """|z| of the normals of sampled points, and spacing."""
     from scipy.spatial import cKDTree
 
     some = xyz[:: max(1, len(xyz) // SAMPLES)]
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)  # several times faster to build
     distance, index = tree.query(some, min(PLANE_NEIGHBOURS, len(xyz)), workers=-1)
     spacing = float(np.median(distance[:, 1:7].mean(axis=1))) / LATTICE_SPACING_CELLS
-    around = xyz[index].astype(np.float64)
+    _, vectors = _planes(xyz[index])
+    return np.abs(vectors[:, 2, 0]).astype(np.float32), spacing
+
+
+def _planes(groups: F32) -> tuple[F64, F64]:
+    """Variances (S, 3), ascending, and axes (S, 3, 3) of groups of points (S, K, 3); the first axis is the normal."""
+    around = groups.astype(np.float64)
     around -= around.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / around.shape[1])
-    flat = values[:, 0] < 0.1 * values[:, 1]
-    noise = float(np.median(np.sqrt(np.maximum(values[flat, 0], 0)))) if flat.any() else 0.0
-    return np.abs(vectors[:, 2, 0]).astype(np.float32), noise, spacing
+    return values, vectors
+
+
+def _noise(xyz: F32) -> float:
+    """Standard deviation of points around planes, metres."""
+    from scipy.spatial import cKDTree
+
+    left = xyz[:: max(1, len(xyz) // NOISE_SAMPLES)]
+    found = [np.zeros(0)]
+    for step in NOISE_THINNING:
+        part = xyz[::step]
+        if len(part) < NOISE_NEIGHBOURS or not len(left):
+            break
+        _, index = cKDTree(part, balanced_tree=False, compact_nodes=False).query(left, NOISE_NEIGHBOURS, workers=-1)
+        values, _ = _planes(part[index])
+        flat = (values[:, 0] < NOISE_MAX_RATIO * values[:, 1]) & (values[:, 2] < NOISE_MAX_WIDTH_M**2)
+        found.append(np.sqrt(np.maximum(values[flat, 0], 0) * NOISE_NEIGHBOURS / (NOISE_NEIGHBOURS - 3)))
+        left = left[~flat]
+    deviations = np.concatenate(found)
+    return float(np.median(deviations)) if len(deviations) else 0.0
 
 
 def _ceiling_share(xyz: F32) -> float:
