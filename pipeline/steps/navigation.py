@@ -205,7 +205,7 @@ def _intensity(inputs: Inputs, xyz: F32) -> F32 | None:
     order = np.lexsort(np.floor(xyz / BLOCK_M).T)
     nearest = np.empty(len(xyz), np.int64)
     nearest[order] = cKDTree(cloud.xyz).query(xyz[order], distance_upper_bound=NEAR_M, workers=-1)[1]
-    known = np.append(cloud.intensity, np.median(cloud.intensity))  # the last: no point is near
+    known: F32 = np.append(cloud.intensity, np.median(cloud.intensity)).astype(np.float32)  # the last: no point is near
     return (known[nearest] / INTENSITY_SCALE).astype(np.float32)
 
 
