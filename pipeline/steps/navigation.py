@@ -26,6 +26,7 @@ their nearest points took most of the step's time."""
 INTENSITY_SCALE = 257.0
 """Intensities of clouds (16 bits) per level of the PCD's, which are 0 to 255."""
 FOLDER_FILE = "navigation.json"
+"""In the step's folder: spawn pose and storeys in the frame "world", whose origin in the CRS is `world_origin_m`."""
 MAX_FLOAT32_M = 10_000.0
 """Coordinates above this are written as float64: float32 would round them to a millimetre."""
 SOFT = ("mesh.ceiling", "mesh.vegetation")
@@ -141,7 +142,9 @@ def _write_maps(
         )
     elif not chosen.turns:
         warnings.append(f"the supplied robot can't turn at its spawn pose, {chosen.clearance:.2f} m from obstacles")
-    body = {"frame": "world", "spawn": spawn, "storeys": about, "band_m": asdict(band)}
+    body = {
+        "frame": "world", "world_origin_m": list(origin), "spawn": spawn, "storeys": about, "band_m": asdict(band)
+    }  # fmt: skip
     (folder / FOLDER_FILE).write_text(json.dumps(body, indent=2) + "\n", encoding="utf-8")
     return {"storeys": about, "spawn": spawn, "resolution_m": round(found[0].grid.cell, 4)}
 
@@ -209,4 +212,4 @@ def _intensity(inputs: Inputs, xyz: F32) -> F32 | None:
     return (known[nearest] / INTENSITY_SCALE).astype(np.float32)
 
 
-NAVIGATION = Step("navigation", 5, navigation, NavigationParams)
+NAVIGATION = Step("navigation", 6, navigation, NavigationParams)

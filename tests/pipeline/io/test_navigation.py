@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from scan2sim.data_samples.building import Style, build
+from scan2sim.pipeline.camera.renderer import Body, Renderer, pinhole
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, Frame, Mesh, PointCloud
@@ -25,6 +26,7 @@ from scan2sim.pipeline.io.worlds.scene import RobotMapFrame, read_scene, save_ti
 from scan2sim.pipeline.simulation.occupancy import FREE, OCCUPIED, UNKNOWN, Storey
 from scan2sim.pipeline.simulation.spans import Grid
 from scan2sim.pipeline.steps.navigation import NAVIGATION, NavigationParams
+from scan2sim.pipeline.steps.pictures import robot_pose
 from tests.fakes import synthetic
 from tests.fakes.interpreters import ROS_PYTHON
 from tests.fakes.steps import step_params
@@ -133,6 +135,18 @@ def test_map_and_spawn_pose_are_in_world_coordinates(step: tuple[Path, Mesh]) ->
     assert np.hypot(x, y) < 1.5 and z == pytest.approx(-0.48, abs=0.02) and about["spawn"]["clearance_m"] >= 0.6
 
 
+def test_robot_sees_the_room_ahead_at_the_height_of_its_camera(step: tuple[Path, Mesh]) -> None:
+    folder, world = step
+    frame = Frame(origin=ORIGIN)
+    pose = robot_pose(folder, frame)
+    assert pose is not None
+    x, y, z = frame.to_crs(pose[None, :3, 3])[0]
+    assert np.hypot(x, y) < 1.7 and z + 0.5 == pytest.approx(0.6, abs=0.05)  # the floor is at -0.5
+    ahead = Renderer([Body(world.moved_to(frame))]).view(pinhole(64, 36), pose)
+    middle_row = ahead.range[18]
+    assert ahead.hit.mean() > 0.99 and middle_row.min() > 0.5 and middle_row[32] > 2
+
+
 def test_world_without_a_floor_gets_points_and_a_warning(tmp_path: Path) -> None:
     wall = Mesh(Frame(), np.array([[0, 0, 0], [4, 0, 0], [4, 0, 2]], np.float32), np.array([[0, 1, 2]], np.int32))
     wall.save(tmp_path / "mesh.npz")
@@ -140,6 +154,7 @@ def test_world_without_a_floor_gets_points_and_a_warning(tmp_path: Path) -> None
     inputs = {"collision": tmp_path / "mesh.npz", "mesh.building": tmp_path / "mesh.npz"}
     done = NAVIGATION.run(inputs, step_params(NavigationParams, **context), tmp_path, silent)
     assert {file.name for file in done.files["navigation"].iterdir()} == {"map.pcd"}
+    assert robot_pose(done.files["navigation"], Frame()) is None
     assert "no occupancy map" in done.warnings[0]
 
 
