@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64
 from scan2sim.pipeline.geometry.height_map import LATTICE_SPACING_CELLS
+from scan2sim.pipeline.geometry.sorting import stable_argsort
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Scene = Literal["indoor", "outdoor"]
 SAMPLES = 20_000
@@ -74,12 +78,13 @@ def describe(xyz: F32, start: F64) -> MapDescription:
         xyz: (N, 3) metres, z up, without outliers.
         start: (3,) position of the sensor at its start, in the same axes.
     """
-    normal_z, spacing = _surfaces(xyz)
+    tree = _tree(xyz)
+    normal_z, spacing = _surfaces(xyz, tree)
     level, upright = float((normal_z > LEVEL_MIN_NORMAL_Z).mean()), float((normal_z < UPRIGHT_MAX_NORMAL_Z).mean())
     ceiling, enclosed = _ceiling_share(xyz), _enclosed_share(xyz, start)
     indoor = ceiling > INDOOR_MIN_CEILING_SHARE or enclosed > INDOOR_MIN_ENCLOSED_SHARE
     scene: Scene = "indoor" if indoor else "outdoor"
-    return MapDescription(spacing, _noise(xyz), level, upright, ceiling, enclosed, scene)
+    return MapDescription(spacing, _noise(xyz, tree), level, upright, ceiling, enclosed, scene)
 
 
 def _enclosed_share(xyz: F32, start: F64) -> float:
@@ -93,12 +98,15 @@ def _enclosed_share(xyz: F32, start: F64) -> float:
     return float((count > SECTOR_MIN_POINTS).mean())
 
 
-def _surfaces(xyz: F32) -> tuple[F32, float]:
-    """|z| of the normals of sampled points, and spacing."""
+def _tree(xyz: F32) -> cKDTree:
     from scipy.spatial import cKDTree
 
+    return cKDTree(xyz, balanced_tree=False, compact_nodes=False)  # several times faster to build
+
+
+def _surfaces(xyz: F32, tree: cKDTree) -> tuple[F32, float]:
+    """|z| of the normals of sampled points, and spacing; the tree is that of the points."""
     some = xyz[:: max(1, len(xyz) // SAMPLES)]
-    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)  # several times faster to build
     distance, index = tree.query(some, min(PLANE_NEIGHBOURS, len(xyz)), workers=-1)
     spacing = float(np.median(distance[:, 1:7].mean(axis=1))) / LATTICE_SPACING_CELLS
     _, vectors = _planes(xyz[index])
@@ -113,17 +121,15 @@ def _planes(groups: F32) -> tuple[F64, F64]:
     return values, vectors
 
 
-def _noise(xyz: F32) -> float:
-    """Standard deviation of points around planes, metres."""
-    from scipy.spatial import cKDTree
-
+def _noise(xyz: F32, tree: cKDTree) -> float:
+    """Standard deviation of points around planes, metres; the tree is that of the points."""
     left = xyz[:: max(1, len(xyz) // NOISE_SAMPLES)]
     found = [np.zeros(0)]
     for step in NOISE_THINNING:
         part = xyz[::step]
         if len(part) < NOISE_NEIGHBOURS or not len(left):
             break
-        _, index = cKDTree(part, balanced_tree=False, compact_nodes=False).query(left, NOISE_NEIGHBOURS, workers=-1)
+        _, index = (tree if step == 1 else _tree(part)).query(left, NOISE_NEIGHBOURS, workers=-1)
         values, _ = _planes(part[index])
         flat = (values[:, 0] < NOISE_MAX_RATIO * values[:, 1]) & (values[:, 2] < NOISE_MAX_WIDTH_M**2)
         found.append(np.sqrt(np.maximum(values[flat, 0], 0) * NOISE_NEIGHBOURS / (NOISE_NEIGHBOURS - 3)))
@@ -137,9 +143,10 @@ def _ceiling_share(xyz: F32) -> float:
     cell = np.floor(xyz[:, :2] / PLAN_CELL_M).astype(np.int64)
     cell -= cell.min(axis=0)
     key = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
-    order = np.lexsort((xyz[:, 2], key))
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    z = xyz[order, 2]
+    by_height = np.argsort(xyz[:, 2])
+    order, key = stable_argsort(key[by_height])  # several times faster than np.lexsort
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    z = xyz[by_height[order], 2]
     ends = np.append(starts[1:], len(order)) - 1
     low = z[(starts + 0.1 * (ends - starts)).astype(np.int64)]
     high = z[(ends - 0.02 * (ends - starts)).astype(np.int64)]
