@@ -38,7 +38,7 @@ def read_thinned(clouds: Sequence[Path], frame: Frame, count: int, report: Repor
             number += len(chunk)
             report(0.2 * min(1.0, number / count), f"reading: {number / 1e6:.0f} of {count / 1e6:.0f} million points")
             local = frame.to_local(chunk.frame.to_crs(chunk.xyz)).astype(np.float32)
-            part = replace(chunk, xyz=local, frame=frame).take(np.isfinite(local).all(axis=1))
+            part = replace(chunk, xyz=local, frame=frame).take(np.asarray(np.isfinite(local).all(axis=1)))
             kept.append(_one_per_cube(part, side) if side else part)
             if sum(map(len, kept)) > MAX_POINTS:
                 whole = PointCloud.join(kept)
