@@ -171,15 +171,16 @@ def find_walls(xyz: F32, height: F64, floor: F32, layer: float, room: float, spa
     """
     if not len(xyz):
         return []
+    xy = xyz[:, :2].astype(np.float64)
     free = np.ones(len(xyz), bool)
     runs = []
     for run in find_runs(columns(xyz, spacing)):
-        own = np.flatnonzero(run.contains(xyz) & free)
+        own = np.flatnonzero(run.contains(xy) & free)
         if not _is_wall(run, xyz[own], height[own], floor, layer, room):
             continue
-        run = refined(run, xyz)
+        run = refined(run, xy)
         runs.append(run)
-        free &= ~run.contains(xyz, MODEL.wall_margin)
+        free &= ~run.contains(xy, MODEL.wall_margin)
     return runs
 
 
@@ -194,12 +195,13 @@ def _in_walls(xyz: F32, runs: list[Run], spacing: float) -> Bools:
     margin, cell = MODEL.wall_margin, max(0.15, 2.5 * spacing)
     depth = MODEL.furniture_depth
     noise = wall_noise(runs)
+    xy = xyz[:, :2].astype(np.float64)
     beyond = np.ones(len(xyz), bool)
     for run in runs:
-        beyond &= ~replace(run, start=run.start - depth, end=run.end + depth).contains(xyz, margin)
+        beyond &= ~replace(run, start=run.start - depth, end=run.end + depth).contains(xy, margin)
     result = np.zeros(len(xyz), bool)
     for run in runs:
-        d, u = run.coordinates(xyz)
+        d, u = run.coordinates(xy)
         near = np.flatnonzero((np.abs(d) <= run.half + depth) & (u >= run.start - depth) & (u <= run.end + depth))
         rooms = [np.count_nonzero((s * d > run.half + depth) & (s * d < run.half + 4 * depth)
                  & (u > run.start) & (u < run.end)) for s in (-1.0, 1.0)]  # fmt: skip
@@ -283,9 +285,10 @@ def _pillars(xyz: F32, height: F64, floor: F32, layer: float, runs: list[Run], r
     """
     from scipy import ndimage
 
+    xy = xyz[:, :2].astype(np.float64)
     free, in_wall = height > 0.0, np.zeros(len(xyz), bool)
     for run in runs:
-        own = run.contains(xyz, 0.08)
+        own = run.contains(xy, 0.08)
         free &= ~own
         in_wall |= own
     rest = np.flatnonzero(free)

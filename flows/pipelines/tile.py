@@ -188,10 +188,11 @@ def build_graph(
     roads = _add_roads(graph, scan, textured, origin)
     sky = _add_sky(graph, scan, photos)
     backdrop = _add_backdrop(graph, scan, surfaces, photos)
-    more = lists | roads | sky | backdrop | splats | solid | origin
-    _export(graph, scan, parts, closed, textured, photos, parked["textured"], more)
+    navigation = _add_navigation(graph, scan, closed, solid | origin)
+    more = lists | roads | sky | backdrop | splats | solid | origin | navigation
+    _export(graph, scan, parts, textured, photos, parked["textured"], more)
     _measure(graph, scan, parts, surfaces, textured, photos, synthesized, sky | backdrop | splats)
-    _show(graph, scan, parts, textured, photos, sky, splats)
+    _show(graph, scan, parts, textured, photos, sky, splats, navigation)
     return graph.tasks
 
 
@@ -647,7 +648,6 @@ def _export(
     graph: TileGraph,
     scan: Scan,
     parts: Parts,
-    surfaces: Sources,
     textured: Sources,
     photos: Sources,
     parked: Sources,
@@ -658,11 +658,9 @@ def _export(
     planted = textured | _plant_models(graph, "textured") | parked
     choice = {f"choice.{group}": output(VIEW_SELECTION, "choice", group) for group in parts.groups}
     floor = {"floor": output(FLOOR, "mask")} if _has_floor(graph) else {}
-    frames = _frames(graph.tile, graph.settings)
-    placed: Sources = {str(name): more[name] for name in ("collision", "origin") if name in more}
-    found = _add_navigation(graph, scan, surfaces, placed, frames) | _add_reflectance(graph, scan, textured)
-    inputs = planted | choice | parts.instances | {"views": photos["cameras"]} | floor | more | found
-    add(EXPORT, inputs, **_export_context(graph, frames))
+    reflectance = _add_reflectance(graph, scan, textured)
+    inputs = planted | choice | parts.instances | {"views": photos["cameras"]} | floor | more | reflectance
+    add(EXPORT, inputs, **_export_context(graph))
     if graph.params(EXPORT).rasters:
         add(RASTERS, textured, name=name, **_raster_context(graph.settings))
 
@@ -677,9 +675,7 @@ def _add_reflectance(graph: TileGraph, scan: Scan, textured: Sources) -> Sources
     return {"reflectance": graph.output(REFLECTANCE, "reflectance")}
 
 
-def _add_navigation(
-    graph: TileGraph, scan: Scan, surfaces: Sources, placed: Sources, frames: Mapping[str, Any]
-) -> Sources:
+def _add_navigation(graph: TileGraph, scan: Scan, surfaces: Sources, placed: Sources) -> Sources:
     """Occupancy maps and points for localization; returns them as an input of the export.
 
     `placed` are the collision mesh and the world's origin.
@@ -690,7 +686,9 @@ def _add_navigation(
         return {}
     cloud = {"cloud": graph.output(DYNAMIC_OBJECTS, "cloud")} if robot_map else {}
     meshes = placed | _mesh_inputs(surfaces)
-    context = dict(frames) | ({"spacing": robot_map.spacing, "has_floor": _has_floor(graph)} if robot_map else {})
+    context = _frames(graph.tile, graph.settings)
+    if robot_map:
+        context |= {"spacing": robot_map.spacing, "has_floor": _has_floor(graph)}
     graph.add(NAVIGATION, meshes | cloud | scan.path, **context)
     return {"navigation": graph.output(NAVIGATION, "navigation")}
 
@@ -704,9 +702,10 @@ def _frames(tile: Tile, settings: Settings) -> dict[str, Any]:
     return frames
 
 
-def _export_context(graph: TileGraph, frames: Mapping[str, Any]) -> dict[str, Any]:
+def _export_context(graph: TileGraph) -> dict[str, Any]:
     """Context of `export`: name and frames, and whether the tile shows rooms."""
-    return {"name": graph.tile.name, **frames} | ({"indoor": True} if _is_indoor(graph) else {})
+    indoor = {"indoor": True} if _is_indoor(graph) else {}
+    return {"name": graph.tile.name, **_frames(graph.tile, graph.settings), **indoor}
 
 
 def world_origin(tile: Tile, settings: Settings) -> tuple[float, float, float] | None:
@@ -757,12 +756,19 @@ def _measure(
 
 
 def _show(
-    graph: TileGraph, scan: Scan, parts: Parts, textured: Sources, photos: Sources, sky: Sources, splats: Sources
+    graph: TileGraph,
+    scan: Scan,
+    parts: Parts,
+    textured: Sources,
+    photos: Sources,
+    sky: Sources,
+    splats: Sources,
+    navigation: Sources,
 ) -> None:
     """The walkable preview and the pictures of the report."""
     graph.add(PREVIEW, textured | _plant_models(graph, "textured") | scan.path | splats)
     stages = {f"decimate.{group}": graph.output(DECIMATE, "mesh", group) for group in parts.groups}
-    graph.add(PICTURES, textured | stages | parts.clouds | {"views": photos["views"]} | sky | scan.path)
+    graph.add(PICTURES, textured | stages | parts.clouds | {"views": photos["views"]} | sky | scan.path | navigation)
 
 
 def _other_clouds(parts: Parts, group: str) -> Sources:

@@ -84,8 +84,11 @@ class Run:
 
     def contains(self, xyz: F32 | F64, margin: float = 0.0) -> Bools:
         """(N,) whether points are in the wall."""
-        d, u = self.coordinates(xyz)
-        return (np.abs(d) <= self.half + margin) & (u >= self.start - margin) & (u <= self.end + margin)
+        xy = np.asarray(xyz[:, :2], np.float64)
+        inside = np.abs(xy @ self.normal - self.offset) <= self.half + margin
+        u = xy[inside] @ self.along
+        inside[inside] = (u >= self.start - margin) & (u <= self.end + margin)
+        return inside
 
 
 @dataclass
@@ -241,12 +244,12 @@ def _turned(run: Run, angle: float) -> Run:
     return Run(normal, float(middle @ normal), centre - run.length / 2, centre + run.length / 2, run.half)
 
 
-def refined(run: Run, xyz: F32) -> Run:
-    """The run with offset and thickness of its own points (N, 3): extents of most parts, so that cupboards don't count.
+def refined(run: Run, xy: F64) -> Run:
+    """The run with offset and thickness of its own points (N, 2): extents of most parts, so that cupboards don't count.
 
     Furniture at a wall extends some of its parts on one side only.
     """
-    near = xyz[run.contains(xyz, 0.05)]
+    near = xy[run.contains(xy, 0.05)]
     d, u = run.coordinates(near)
     bins = max(1, round(run.length / 0.5))
     k = np.clip(((u - run.start) / run.length * bins).astype(np.int64), 0, bins - 1)

@@ -116,14 +116,15 @@ def wall_runs(points: F32, spacing: float) -> list[Run]:
     """Lines of the walls of a storey, from its wall points (N, 3)."""
     if len(points) < 50:
         return []
+    xy = points[:, :2].astype(np.float64)
     free = np.ones(len(points), bool)
     runs: list[Run] = []
     for run in find_runs(columns(points, spacing)):
-        own = run.contains(points) & free
-        if own.sum() < max(30.0, 0.25 * run.contains(points).sum()):
+        own = run.contains(xy)
+        if (own & free).sum() < max(30.0, 0.25 * own.sum()):
             continue
-        runs.append(refined(run, points))
-        free &= ~runs[-1].contains(points, 0.05)
+        runs.append(refined(run, xy))
+        free &= ~runs[-1].contains(xy, 0.05)
     return runs
 
 

@@ -20,6 +20,7 @@ from scan2sim.pipeline.core.step import Params, Report, silent
 from scan2sim.pipeline.core.types import F32, F64, Bools, Camera, Frame, PointCloud, Trajectory
 from scan2sim.pipeline.geometry.height_map import exact_point_spacing
 from scan2sim.pipeline.geometry.upright import Upright, find_up, rotation_to_z
+from scan2sim.pipeline.importers import large_maps
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io import trajectory as trajectory_io
@@ -124,7 +125,7 @@ def import_map(
         DataError: fewer than 1000 points, or all of them on a line.
     """
     report(0.0, "reading")
-    cloud, crs = _read(clouds, warn)
+    cloud, crs = _read(clouds, warn, report)
     spacing = exact_point_spacing(cloud.xyz)
     unit = 1.0 if crs else unit_of(cloud.xyz, spacing, params, warn)
     origin = np.asarray(cloud.frame.origin) * unit
@@ -217,8 +218,8 @@ def check_height(xyz: F32, warn: Callable[[str], None]) -> None:
         warn(f"it is {height:,.0f} m high: if it isn't, name the unit of its coordinates (--units cm, for example)")
 
 
-def _read(clouds: Sequence[Path], warn: Callable[[str], None]) -> tuple[PointCloud, str | None]:
-    """All points with finite coordinates, once each, in the unit of the map (with a CRS in metres); and the CRS."""
+def _read(clouds: Sequence[Path], warn: Callable[[str], None], report: Report) -> tuple[PointCloud, str | None]:
+    """The points with finite coordinates, once each, in the unit of the map (with a CRS in metres); and the CRS."""
     headers = [cloud_io.read_header(path) for path in clouds]
     for path, header in zip(clouds, headers, strict=True):
         for note in (*header.notes, *cloud_io.flag_notes(path)):
@@ -226,6 +227,8 @@ def _read(clouds: Sequence[Path], warn: Callable[[str], None]) -> tuple[PointClo
     ends = np.array([(header.low, header.high) for header in headers])
     ends = np.where(np.isfinite(ends), ends, 0.0)
     middle = (ends.min(axis=(0, 1)) + ends.max(axis=(0, 1))) / 2
+    if np.ptp(ends, axis=(0, 1)).max() > FAR_ORIGIN_M:  # a stray point would make it the map of a survey
+        middle = np.median(cloud_io.read(clouds[0], Frame()).xyz, axis=0).astype(np.float64)
     far = np.abs(middle).max() > FAR_ORIGIN_M
     x, y, z = (np.floor(middle) if far else np.zeros(3)).tolist()
     crs: str | None = None
@@ -233,7 +236,13 @@ def _read(clouds: Sequence[Path], warn: Callable[[str], None]) -> tuple[PointClo
     if any(header.crs for header in headers):
         crs, unit = crs_io.common(clouds[0], None, None, clouds, headers)
     frame = Frame(crs or "local", (x * unit, y * unit, z * unit), unit)
-    cloud = PointCloud.join([cloud_io.read(path, frame) for path in clouds])
+    count = sum(header.count for header in headers)
+    if count > large_maps.MAX_POINTS:
+        cloud, side = large_maps.read_thinned(clouds, frame, count, report)
+        if side:
+            warn(f"{count:,} points were thinned to {len(cloud):,}: one per cube of {side:.2g} (unit of the map)")
+    else:
+        cloud = PointCloud.join([cloud_io.read(path, frame) for path in clouds])
     finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
     cloud = _without(cloud, ~finite, "points with NaN coordinates", warn)
     if len(cloud):

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from scan2sim.pipeline.core.types import F32, F64
 from scan2sim.pipeline.geometry.height_map import LATTICE_SPACING_CELLS
+from scan2sim.pipeline.geometry.sorting import stable_argsort
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Scene = Literal["indoor", "outdoor"]
 SAMPLES = 20_000
@@ -17,6 +21,12 @@ MILLIMETRE_MIN_SPACING = 3.0
 MILLIMETRE_MIN_HEIGHT = 500.0
 """Spacing and smallest extent from which coordinates are millimetres: no map in metres is so thin and so high."""
 PLANE_NEIGHBOURS = 12
+NOISE_SAMPLES, NOISE_NEIGHBOURS = 2_000, 25
+NOISE_THINNING = (1, 4, 16, 64, 256)
+"""Noise is measured in neighbourhoods of every n-th point that are several times as wide as it: n for each sample is
+the smallest of these at which variance across the plane is at most `NOISE_MAX_RATIO` of that along it."""
+NOISE_MAX_RATIO, NOISE_MAX_WIDTH_M = 0.04, 0.5
+"""Of wider ones (standard deviation along the plane), the shape of the ground would count as noise."""
 PLAN_CELL_M = 0.5
 """Cell of the raster in plan view in which heights are compared."""
 CEILING_HEIGHT_M = (1.8, 6.0)
@@ -39,7 +49,7 @@ class MapDescription:
 
     Attributes:
         spacing: median over points of the mean distance to six neighbours, on the scale of a square lattice.
-        noise: median distance of points from the plane through their neighbours.
+        noise: median over points of the standard deviation around the plane through their neighbours; 0: none is flat.
         level_share, upright_share: shares of points whose normals are vertical and horizontal.
         ceiling_share: share of the columns in plan view with a ceiling.
         enclosed_share: share of the directions around the sensor's start that a wall closes.
@@ -68,12 +78,13 @@ def describe(xyz: F32, start: F64) -> MapDescription:
         xyz: (N, 3) metres, z up, without outliers.
         start: (3,) position of the sensor at its start, in the same axes.
     """
-    normal_z, noise, spacing = _surfaces(xyz)
+    tree = _tree(xyz)
+    normal_z, spacing = _surfaces(xyz, tree)
     level, upright = float((normal_z > LEVEL_MIN_NORMAL_Z).mean()), float((normal_z < UPRIGHT_MAX_NORMAL_Z).mean())
     ceiling, enclosed = _ceiling_share(xyz), _enclosed_share(xyz, start)
     indoor = ceiling > INDOOR_MIN_CEILING_SHARE or enclosed > INDOOR_MIN_ENCLOSED_SHARE
     scene: Scene = "indoor" if indoor else "outdoor"
-    return MapDescription(spacing, noise, level, upright, ceiling, enclosed, scene)
+    return MapDescription(spacing, _noise(xyz, tree), level, upright, ceiling, enclosed, scene)
 
 
 def _enclosed_share(xyz: F32, start: F64) -> float:
@@ -87,20 +98,44 @@ def _enclosed_share(xyz: F32, start: F64) -> float:
     return float((count > SECTOR_MIN_POINTS).mean())
 
 
-def _surfaces(xyz: F32) -> tuple[F32, float, float]:
-    """|z| of the normals of sampled points, their median distance from the plane through their neighbours; spacing."""
+def _tree(xyz: F32) -> cKDTree:
     from scipy.spatial import cKDTree
 
+    return cKDTree(xyz, balanced_tree=False, compact_nodes=False)  # several times faster to build
+
+
+def _surfaces(xyz: F32, tree: cKDTree) -> tuple[F32, float]:
+    """|z| of the normals of sampled points, and spacing; the tree is that of the points."""
     some = xyz[:: max(1, len(xyz) // SAMPLES)]
-    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)  # several times faster to build
     distance, index = tree.query(some, min(PLANE_NEIGHBOURS, len(xyz)), workers=-1)
     spacing = float(np.median(distance[:, 1:7].mean(axis=1))) / LATTICE_SPACING_CELLS
-    around = xyz[index].astype(np.float64)
+    _, vectors = _planes(xyz[index])
+    return np.abs(vectors[:, 2, 0]).astype(np.float32), spacing
+
+
+def _planes(groups: F32) -> tuple[F64, F64]:
+    """Variances (S, 3), ascending, and axes (S, 3, 3) of groups of points (S, K, 3); the first axis is the normal."""
+    around = groups.astype(np.float64)
     around -= around.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / around.shape[1])
-    flat = values[:, 0] < 0.1 * values[:, 1]
-    noise = float(np.median(np.sqrt(np.maximum(values[flat, 0], 0)))) if flat.any() else 0.0
-    return np.abs(vectors[:, 2, 0]).astype(np.float32), noise, spacing
+    return values, vectors
+
+
+def _noise(xyz: F32, tree: cKDTree) -> float:
+    """Standard deviation of points around planes, metres; the tree is that of the points."""
+    left = xyz[:: max(1, len(xyz) // NOISE_SAMPLES)]
+    found = [np.zeros(0)]
+    for step in NOISE_THINNING:
+        part = xyz[::step]
+        if len(part) < NOISE_NEIGHBOURS or not len(left):
+            break
+        _, index = (tree if step == 1 else _tree(part)).query(left, NOISE_NEIGHBOURS, workers=-1)
+        values, _ = _planes(part[index])
+        flat = (values[:, 0] < NOISE_MAX_RATIO * values[:, 1]) & (values[:, 2] < NOISE_MAX_WIDTH_M**2)
+        found.append(np.sqrt(np.maximum(values[flat, 0], 0) * NOISE_NEIGHBOURS / (NOISE_NEIGHBOURS - 3)))
+        left = left[~flat]
+    deviations = np.concatenate(found)
+    return float(np.median(deviations)) if len(deviations) else 0.0
 
 
 def _ceiling_share(xyz: F32) -> float:
@@ -108,9 +143,10 @@ def _ceiling_share(xyz: F32) -> float:
     cell = np.floor(xyz[:, :2] / PLAN_CELL_M).astype(np.int64)
     cell -= cell.min(axis=0)
     key = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
-    order = np.lexsort((xyz[:, 2], key))
-    starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    z = xyz[order, 2]
+    by_height = np.argsort(xyz[:, 2])
+    order, key = stable_argsort(key[by_height])  # several times faster than np.lexsort
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    z = xyz[by_height[order], 2]
     ends = np.append(starts[1:], len(order)) - 1
     low = z[(starts + 0.1 * (ends - starts)).astype(np.int64)]
     high = z[(ends - 0.02 * (ends - starts)).astype(np.int64)]

@@ -20,9 +20,13 @@ from scan2sim.pipeline.simulation import ground_origin
 MAX_CLOUD_POINTS = 10_000_000
 BLOCK_M = 0.5
 """Points are queried block by block: neighbours use the same part of the search tree, which is four times as fast."""
+NEAR_M = 0.5
+"""Surfaces farther than this from all points, such as floors under furniture, get the median intensity: a search for
+their nearest points took most of the step's time."""
 INTENSITY_SCALE = 257.0
 """Intensities of clouds (16 bits) per level of the PCD's, which are 0 to 255."""
 FOLDER_FILE = "navigation.json"
+"""In the step's folder: spawn pose and storeys in the frame "world", whose origin in the CRS is `world_origin_m`."""
 MAX_FLOAT32_M = 10_000.0
 """Coordinates above this are written as float64: float32 would round them to a millimetre."""
 SOFT = ("mesh.ceiling", "mesh.vegetation")
@@ -79,8 +83,9 @@ def navigation(inputs: Inputs, params: NavigationParams, out: Path, report: Repo
     """Write occupancy maps of the `collision` mesh, a spawn pose, and points of the visual meshes (`mesh.CLASS`).
 
     The robot starts where the `path` begins, or else at the origin of its map. Intensities are those of the nearest
-    points of `cloud` (optional). File: `navigation`, a folder with `map.yaml` and `map.pgm` (the storey of the start;
-    others: `map_1` ...), `map.pcd` (only for robots' maps, in the map's frame and unit), and `navigation.json`.
+    points of `cloud` (optional), or its median where none is near. File: `navigation`, a folder with `map.yaml` and
+    `map.pgm` (the storey of the start; others: `map_1` ...), `map.pcd` (only for robots' maps, in the map's frame and
+    unit), and `navigation.json`.
 
     Without a floor that a robot fits on there are no maps and no pose, and a warning.
 
@@ -137,7 +142,9 @@ def _write_maps(
         )
     elif not chosen.turns:
         warnings.append(f"the supplied robot can't turn at its spawn pose, {chosen.clearance:.2f} m from obstacles")
-    body = {"frame": "world", "spawn": spawn, "storeys": about, "band_m": asdict(band)}
+    body = {
+        "frame": "world", "world_origin_m": list(origin), "spawn": spawn, "storeys": about, "band_m": asdict(band)
+    }  # fmt: skip
     (folder / FOLDER_FILE).write_text(json.dumps(body, indent=2) + "\n", encoding="utf-8")
     return {"storeys": about, "spawn": spawn, "resolution_m": round(found[0].grid.cell, 4)}
 
@@ -192,7 +199,7 @@ def _write_points(inputs: Inputs, context: NavigationContext, path: Path) -> int
 
 
 def _intensity(inputs: Inputs, xyz: F32) -> F32 | None:
-    """(N,) intensities 0 to 255 of the nearest points of the cloud, if it has any."""
+    """(N,) intensities 0 to 255 of the nearest points of the cloud, if it has any; the median where none is near."""
     from scipy.spatial import cKDTree
 
     cloud = PointCloud.load(inputs["cloud"]) if "cloud" in inputs else None
@@ -200,8 +207,9 @@ def _intensity(inputs: Inputs, xyz: F32) -> F32 | None:
         return None
     order = np.lexsort(np.floor(xyz / BLOCK_M).T)
     nearest = np.empty(len(xyz), np.int64)
-    nearest[order] = cKDTree(cloud.xyz).query(xyz[order], workers=-1)[1]
-    return (cloud.intensity[nearest] / INTENSITY_SCALE).astype(np.float32)
+    nearest[order] = cKDTree(cloud.xyz).query(xyz[order], distance_upper_bound=NEAR_M, workers=-1)[1]
+    known: F32 = np.append(cloud.intensity, np.median(cloud.intensity)).astype(np.float32)  # the last: no point is near
+    return (known[nearest] / INTENSITY_SCALE).astype(np.float32)
 
 
-NAVIGATION = Step("navigation", 4, navigation, NavigationParams)
+NAVIGATION = Step("navigation", 6, navigation, NavigationParams)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,11 +14,13 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.classes import CODE, SURFACES, colour_of
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
-from scan2sim.pipeline.core.types import F64, U8, Camera, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, Mesh, PointCloud, Trajectory
 from scan2sim.pipeline.io import sky
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.images.album import Album
+from scan2sim.pipeline.simulation.robot import ROBOT
+from scan2sim.pipeline.steps.navigation import FOLDER_FILE
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.renderer import Image, Renderer
@@ -53,7 +56,8 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     """Render the tile: classes, meshes, triangles, texture pages, the textured world, and comparisons with photos.
 
     Held-out photos are compared first. The textured world is shown from above, without the ceilings of rooms, and from
-    the scanner's viewpoint: that of a driver if there is a path, else an aerial view of the whole tile.
+    the scanner's viewpoint: that of a driver if there is a path, else an aerial view of the whole tile. The world of a
+    robot's map is also shown from the supplied robot's camera at its spawn pose (`navigation`).
     """
     from scan2sim.pipeline.camera import renderer as render
 
@@ -83,6 +87,9 @@ def pictures(inputs: Inputs, params: PicturesParams, out: Path, report: Report) 
     first = first_world.view(camera, eye)
     album.add("hero", first.rgb, "hero", where, "")
     album.add("eye", first.rgb, "world", f"{where}.", what)
+    robot = robot_pose(inputs["navigation"], world.bodies[0].mesh.frame) if "navigation" in inputs else None
+    if robot is not None:
+        album.add("robot", world.view(camera, robot).rgb, "world", "From the robot's eye.", "Where it starts.")
     album.add(
         "above", above(open_world), "world", "From above.", f"{high[0] - low[0]:.0f} m by {high[1] - low[1]:.0f} m."
     )
@@ -179,6 +186,25 @@ def whole_pose(points: npt.NDArray[np.floating], camera: Camera) -> F64:
         back.append((right + left) / 2 / slope)
     pose[:3, 3] = pose[:3, :3] @ np.array([*middle, -max(back)])
     return pose
+
+
+def robot_pose(navigation: Path, frame: Frame) -> F64 | None:
+    """Pose (4, 4) of the supplied robot's camera at its spawn pose, in local coordinates; None: there is no such pose.
+
+    `navigation` is the folder of the step of this name.
+    """
+    from scan2sim.pipeline.camera.renderer import look_at
+
+    file = navigation / FOLDER_FILE
+    if not file.exists():
+        return None
+    about = json.loads(file.read_text(encoding="utf-8"))
+    link = ROBOT.link(ROBOT.camera.link)
+    heading = about["spawn"]["angles_rad"][2]
+    forward = np.array([math.cos(heading), math.sin(heading), 0.0])
+    base = np.add(about["world_origin_m"], about["spawn"]["position_m"]) - np.asarray(frame.origin)
+    eye = base + (link.place[0] + ROBOT.camera.ahead) * forward + [0.0, 0.0, link.place[2]]
+    return look_at(eye, eye + forward)
 
 
 def driver_pose(path: F64 | None, low: F64, high: F64, ground: Any) -> F64:
@@ -280,4 +306,4 @@ def _compared(held: Sequence[bool], coverage: Sequence[float], count: int) -> li
     return sorted(range(len(held)), key=lambda i: (not held[i], -coverage[i]))[:count]
 
 
-PICTURES = Step("pictures", 6, pictures, PicturesParams, memory=(1.3, 3))
+PICTURES = Step("pictures", 7, pictures, PicturesParams, memory=(1.3, 3))

@@ -119,6 +119,7 @@ def _walls(
     walls: list[Wall] = []
     openings: list[Opening] = []
     covered = np.zeros(len(xyz), bool)
+    xy = xyz[:, :2].astype(np.float64)
     for i, storey in enumerate(storeys):
         report(i / len(storeys), f"storey {i + 1} of {len(storeys)}")
         floor, front = (part[(part[:, 2] >= storey.low) & (part[:, 2] < storey.high)] for part in (terrain, furniture))
@@ -130,7 +131,7 @@ def _walls(
         walls += found
         openings += openings_of(found, i)
         for wall in found:
-            inside = wall.run.contains(xyz, COVERED_M) & (xyz[:, 2] > wall.low - COVERED_M)
+            inside = wall.run.contains(xy, COVERED_M) & (xyz[:, 2] > wall.low - COVERED_M)
             covered |= inside & (xyz[:, 2] < wall.high + COVERED_M)
     report(0.9, "pillars")
     boxes = fitted_boxes.fit_boxes(xyz[~covered], spacing, params.boxes)

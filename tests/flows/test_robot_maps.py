@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -97,6 +98,8 @@ def test_map_in_any_state_ends_in_a_world_or_a_reason(tmp_path: Path, case: str)
     if code == 0:
         about = json.loads((tmp_path / "out" / "world" / "metadata.json").read_text(encoding="utf-8"))
         assert about["groups"]
+        report = html.unescape((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
+        assert ("From the robot's eye" in report) == ("spawn" in about.get("navigation", {}))
     else:
         assert "needs" in printed, printed
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from scan2sim.data_samples.building import Style, Surface, build
@@ -13,6 +14,7 @@ from scan2sim.flows.commands.inspect_map import map_facts
 from scan2sim.pipeline.core.types import F32, F64, Frame, PointCloud
 from scan2sim.pipeline.geometry.surface_distance import sample_surface
 from scan2sim.pipeline.geometry.upright import find_up, rotation_to_z
+from scan2sim.pipeline.importers import large_maps
 from scan2sim.pipeline.importers.robot_map import AXES, MapParams, import_map, map_files
 from scan2sim.pipeline.io import clouds
 from scan2sim.pipeline.io.clouds import las
@@ -192,6 +194,35 @@ def test_given_up_axis_overrides_the_estimate(tmp_path: Path) -> None:
 def test_indoor_scene_is_recognized(tmp_path: Path) -> None:
     imported(save(tmp_path / "map.las", room()), tmp_path / "tile")
     assert present(read_tile(tmp_path / "tile").robot_map).scene == "indoor"
+
+
+def test_one_point_far_away_changes_nothing(tmp_path: Path) -> None:
+    xyz = room()
+    stray = np.concatenate([xyz, np.array([[3e5, -2e5, 50]], np.float32)])
+    points, T, warnings = imported(save(tmp_path / "stray.las", stray), tmp_path / "tile")
+    assert np.array_equal(T, np.eye(4)) and points.shape == xyz.shape
+    assert np.abs(points - xyz).max() < 0.002
+    assert any("far points removed" in text for text in warnings)
+
+
+def test_map_that_memory_does_not_hold_is_thinned_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(large_maps, "MAX_POINTS", 20_000)
+    monkeypatch.setattr(clouds, "CHUNK_POINTS", 7_000)
+    (tmp_path / "map").mkdir()
+    parts = [room(seed) for seed in range(4)]
+    far = np.array([[1e5, -1e5, 30]], np.float32)  # its cube has no number of 64 bits
+    for i, xyz in enumerate(parts):
+        save(tmp_path / "map" / f"{i}.las", np.concatenate([far, xyz]) if i == 1 else xyz)
+    warnings: list[str] = []
+    tile = read_tile(import_map(map_files(tmp_path / "map"), tmp_path / "tile", MapParams(), warn=warnings.append))
+    cloud = clouds.read(tile.clouds[0], Frame())
+    assert 8_000 < len(cloud) <= 20_000
+    (text,) = (text for text in warnings if "thinned" in text)
+    assert text.startswith(f"{sum(map(len, parts)) + 1:,} points were thinned to ")
+    side = float(text.split("cube of ")[1].split()[0])
+    gaps = cKDTree(cloud.xyz).query(np.concatenate(parts))[0]
+    assert gaps.max() < 1.8 * side  # the diagonal of a cube
+    assert cKDTree(np.concatenate(parts)).query(cloud.xyz)[0].max() < 0.002  # points of the map, not means
 
 
 def test_folder_without_clouds_is_an_error(tmp_path: Path) -> None:

@@ -14,10 +14,11 @@ import pytest
 import yaml
 
 from scan2sim.data_samples.building import Style, build
+from scan2sim.pipeline.camera.renderer import Body, Renderer, pinhole
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import F64, Frame, Mesh, PointCloud
-from scan2sim.pipeline.geometry.surface_distance import distances
+from scan2sim.pipeline.geometry.surface_distance import distances, sample_surface
 from scan2sim.pipeline.io import clouds, world_formats
 from scan2sim.pipeline.io.navigation import nav2_map, pcd
 from scan2sim.pipeline.io.world_formats import SceneParams
@@ -25,6 +26,7 @@ from scan2sim.pipeline.io.worlds.scene import RobotMapFrame, read_scene, save_ti
 from scan2sim.pipeline.simulation.occupancy import FREE, OCCUPIED, UNKNOWN, Storey
 from scan2sim.pipeline.simulation.spans import Grid
 from scan2sim.pipeline.steps.navigation import NAVIGATION, NavigationParams
+from scan2sim.pipeline.steps.pictures import robot_pose
 from tests.fakes import synthetic
 from tests.fakes.interpreters import ROS_PYTHON
 from tests.fakes.steps import step_params
@@ -75,6 +77,10 @@ def test_pcd_round_trip_in_single_and_double_precision(tmp_path: Path) -> None:
     assert np.abs(far.xyz - xyz).max() < 1e-4 and far.intensity is None
 
 
+def middle(mesh: Mesh) -> np.ndarray:
+    return (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+
+
 @pytest.fixture(scope="module")
 def step(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Mesh]:
     """The step's folder for a building that was mapped in millimetres, y up and tilted; and its mesh in the world."""
@@ -84,8 +90,10 @@ def step(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Mesh]:
     world = Mesh(Frame(), (building.mesh.vertices - start).astype(np.float32), building.mesh.faces)
     mesh = world.moved_to(Frame(origin=ORIGIN))
     mesh.save(folder / "mesh.npz")
-    seen = PointCloud(mesh.frame, mesh.vertices, intensity=np.full(len(mesh.vertices), 257 * 100, np.uint16))
-    seen.save(folder / "cloud.npz")
+    points = sample_surface(mesh, 40_000)
+    at = points + np.asarray(ORIGIN) - middle(world)
+    seen = PointCloud(mesh.frame, points, intensity=(257 * np.where(at[:, 1] < 1, 50, 200)).astype(np.uint16))
+    seen.take(at[:, 0] < 0).save(folder / "cloud.npz")  # half of the building
     context = {
         "world_origin": (0.0, 0.0, 0.0), "T_world_map": tuple(map(tuple, turned().tolist())), "unit": 0.001,
         "spacing": 0.1,
@@ -103,7 +111,13 @@ def test_points_in_the_frame_and_unit_of_the_map_lie_on_the_world(step: tuple[Pa
     placed = 0.001 * cloud.xyz.astype(np.float64) @ turned()[:3, :3].T
     assert distances(placed.astype(np.float32), world).max() < 0.002
     assert len(cloud) == pytest.approx(world.face_area.sum() / 0.01, rel=0.01)
-    assert cloud.intensity is not None and (cloud.intensity == cloud.intensity[0]).all()
+    assert cloud.intensity is not None
+    at = placed - middle(world)
+    seen, left, right = at[:, 0] < -0.5, at[:, 1] < 0.5, at[:, 1] > 1.5
+    level = cloud.intensity / 257
+    assert (level[seen & left] == 50).all() and (level[seen & right] == 200).all()
+    assert (level[at[:, 0] > 0.6] == 50).all()  # no point is near: the median
+    assert (seen & right).sum() > 1000 < (at[:, 0] > 0.6).sum()
 
 
 def test_map_and_spawn_pose_are_in_world_coordinates(step: tuple[Path, Mesh]) -> None:
@@ -121,6 +135,18 @@ def test_map_and_spawn_pose_are_in_world_coordinates(step: tuple[Path, Mesh]) ->
     assert np.hypot(x, y) < 1.5 and z == pytest.approx(-0.48, abs=0.02) and about["spawn"]["clearance_m"] >= 0.6
 
 
+def test_robot_sees_the_room_ahead_at_the_height_of_its_camera(step: tuple[Path, Mesh]) -> None:
+    folder, world = step
+    frame = Frame(origin=ORIGIN)
+    pose = robot_pose(folder, frame)
+    assert pose is not None
+    x, y, z = frame.to_crs(pose[None, :3, 3])[0]
+    assert np.hypot(x, y) < 1.7 and z + 0.5 == pytest.approx(0.6, abs=0.05)  # the floor is at -0.5
+    ahead = Renderer([Body(world.moved_to(frame))]).view(pinhole(64, 36), pose)
+    middle_row = ahead.range[18]
+    assert ahead.hit.mean() > 0.99 and middle_row.min() > 0.5 and middle_row[32] > 2
+
+
 def test_world_without_a_floor_gets_points_and_a_warning(tmp_path: Path) -> None:
     wall = Mesh(Frame(), np.array([[0, 0, 0], [4, 0, 0], [4, 0, 2]], np.float32), np.array([[0, 1, 2]], np.int32))
     wall.save(tmp_path / "mesh.npz")
@@ -128,6 +154,7 @@ def test_world_without_a_floor_gets_points_and_a_warning(tmp_path: Path) -> None
     inputs = {"collision": tmp_path / "mesh.npz", "mesh.building": tmp_path / "mesh.npz"}
     done = NAVIGATION.run(inputs, step_params(NavigationParams, **context), tmp_path, silent)
     assert {file.name for file in done.files["navigation"].iterdir()} == {"map.pcd"}
+    assert robot_pose(done.files["navigation"], Frame()) is None
     assert "no occupancy map" in done.warnings[0]
 
 
