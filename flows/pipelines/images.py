@@ -16,7 +16,8 @@ from scan2sim.pipeline.io.geodata import crs as crs_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.steps.import_photos import IMPORT_PHOTOS, ImportPhotosContext, ImportPhotosParams
 from scan2sim.slam.reconstruction import colmap
-from scan2sim.slam.reconstruction.photos import check_count, list_photos, no_photos
+from scan2sim.slam.reconstruction.lenses import NUMBERS, check_options, lenses
+from scan2sim.slam.reconstruction.photos import check_count, list_photos, no_photos, read_headers
 from scan2sim.slam.reconstruction.positions import check_sources
 from scan2sim.slam.steps.dense_stereo import DENSE_STEREO, DenseStereoParams
 from scan2sim.slam.steps.place_photos import PLACE_PHOTOS, PlaceContext, Placed, PlaceParams
@@ -58,7 +59,9 @@ def build_graph(source: Images, here: Path) -> list[Task]:
     Raises:
         ScanError: photos, positions or the CRS are missing, or COLMAP isn't installed.
     """
-    can_reconstruct(_shared(Reconstructed, source))
+    lens: Reconstructed = _shared(Reconstructed, source)
+    can_reconstruct(lens)
+    check_options(lens)
     photos, is_video = here / source.photos, (here / source.photos).is_file()
     if is_video:
         require("a video", "av")
@@ -76,12 +79,17 @@ def build_graph(source: Images, here: Path) -> list[Task]:
     files: dict[str, Path] = {name: here / path for name, path in given.items() if path is not None}
     cloud = files.get("cloud")
     crs = source.crs or (None if cloud is None else cloud_io.read_header(cloud).crs)
-    placed = check_sources(photos, **files, crs=crs)
+    placed = check_sources(photos, **files, crs=crs, offset=source.gps_offset)
     if cloud is not None and crs is None:
         crs = crs_io.LOCAL
 
-    times = {name: path for name, path in files.items() if name == "times"}
-    tasks = [Task(RECONSTRUCT, _shared(Reconstructed, source), {**folder_inputs("photos", photos), **times})]
+    described = {name: path for name, path in files.items() if name == "times"}
+    if lens.camera_file is not None:
+        described["camera"] = here / lens.camera_file
+        lens = lens.model_copy(update={"camera": "auto"})
+    if "camera" in described or lens.camera != "auto" or any(getattr(lens, name) is not None for name in NUMBERS):
+        lenses(photos, read_headers(photos), lens, described.get("camera"))
+    tasks = [Task(RECONSTRUCT, lens, {**folder_inputs("photos", photos), **described})]
     made = TaskId(RECONSTRUCT.name)
     images: dict[str, Path | Output] = {**folder_inputs("images", photos)}
     if is_video:

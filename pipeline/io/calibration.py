@@ -108,7 +108,9 @@ def photo_extrinsics(path: Path, photos: Path) -> F64 | None:
     return T
 
 
-def read_camera(path: Path, width: int, height: int, *, names: Sequence[str] = (), rectified: bool = False) -> Camera:
+def read_camera(
+    path: Path, width: int, height: int, *, names: Sequence[str] = (), rectified: bool = False, photos: str = ""
+) -> Camera:
     """The camera for photos of a size, from `[[cameras]]` of a TOML file or tile, or another program's calibration.
 
     Args:
@@ -116,6 +118,7 @@ def read_camera(path: Path, width: int, height: int, *, names: Sequence[str] = (
         width, height: size of the photos, pixels.
         names: what the photos' camera may be called in the file (an id, a topic), which decides between several.
         rectified: the photos are rectified: of ROS, the intrinsics of P count.
+        photos: which photos have that size, for messages; "": all.
 
     Raises:
         InputError: no camera of that size, or several that differ, or it is invalid.
@@ -124,7 +127,7 @@ def read_camera(path: Path, width: int, height: int, *, names: Sequence[str] = (
     found = camera_calibrations.read_cameras(path, (width, height)) if is_foreign(path) else _cameras(path)
     fitting = [one for one in found if (one.camera.width, one.camera.height) == (width, height)]
     if not fitting:
-        raise _no_camera_of_size(path, found, width, height)
+        raise _no_camera_of_size(path, found, width, height, photos)
     named = [one for one in fitting if not set(names).isdisjoint(one.names)] or fitting
     if len({one.camera for one in named}) > 1:
         cause = f"has several cameras of {width}x{height} ({', '.join(one.names[0] for one in named)})"
@@ -140,7 +143,15 @@ def read_camera(path: Path, width: int, height: int, *, names: Sequence[str] = (
     return camera_of(path, CameraEntry.model_validate(camera_entry(named[0].names[0], chosen)))  # checks its numbers
 
 
-def _no_camera_of_size(path: Path, found: Sequence[CalibratedCamera], width: int, height: int) -> InputError:
+def camera_names(path: Path, width: int, height: int) -> set[str]:
+    """What the cameras of a file are called in it; arguments and errors as of `read_camera`."""
+    found = camera_calibrations.read_cameras(path, (width, height)) if is_foreign(path) else _cameras(path)
+    return {name for one in found for name in one.names}
+
+
+def _no_camera_of_size(
+    path: Path, found: Sequence[CalibratedCamera], width: int, height: int, photos: str
+) -> InputError:
     """The error of `read_camera`: the sizes that there are, and what to write if the photos were scaled."""
     sizes = ", ".join(f"{one.camera.width}x{one.camera.height}" for one in found) or "none"
     remedy = CAMERAS_REMEDY
@@ -151,7 +162,10 @@ def _no_camera_of_size(path: Path, found: Sequence[CalibratedCamera], width: int
             "If the photos are scaled, not cropped, write a TOML file: [[cameras]] with "
             f"focal = [{c.fx:.3f}, {c.fy:.3f}], centre = [{c.cx:.3f}, {c.cy:.3f}], the same model and distortion"
         )
-    return InputError(path, f"has no camera of {width}x{height} (it has {sizes})", remedy)
+    elif any((one.camera.width, one.camera.height) == (height, width) for one in found):
+        remedy = "The photos are turned by 90 degrees: turn them back without loss (`jpegtran -rotate 90`, or 270)"
+    of = f"{width}x{height}" + (f", the size of {photos}" if photos else "")
+    return InputError(path, f"has no camera of {of} (it has {sizes})", remedy)
 
 
 def _cameras(path: Path) -> list[CalibratedCamera]:

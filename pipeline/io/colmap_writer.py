@@ -111,17 +111,26 @@ def write(
     return [folder / file for file in texts]
 
 
-def _cameras_txt(camera: Camera, frame: Frame) -> str:
-    """Content of `cameras.txt` with its one camera."""
+def colmap_camera(camera: Camera) -> tuple[str, tuple[float, ...]]:
+    """Model of a camera by COLMAP's name, and its parameters in COLMAP's order.
+
+    Raises:
+        KeyError: COLMAP has no counterpart (orthographic).
+    """
     k = (*camera.distortion, *[0.0] * 8)
     at_most_four = len(camera.distortion) <= 4
     focal = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5)
-    model, params = {
+    return {
         "pinhole": ("PINHOLE", focal),
         "opencv": ("OPENCV", (*focal, *k[:4])) if at_most_four else ("FULL_OPENCV", (*focal, *k[:8])),
         "fisheye": ("OPENCV_FISHEYE", (*focal, *k[:4])),
         "equirectangular": ("EQUIRECTANGULAR", (float(camera.width), float(camera.height))),
     }[camera.model]
+
+
+def _cameras_txt(camera: Camera, frame: Frame) -> str:
+    """Content of `cameras.txt` with its one camera."""
+    model, params = colmap_camera(camera)
     crs = " ".join(frame.crs.split())  # WKT may have several lines
     origin = " ".join(f"{value:.12g}" for value in frame.to_crs([0, 0, 0]))
     numbers = " ".join(f"{value:.12g}" for value in params)

@@ -10,7 +10,7 @@ Selection for Unstructured Multi-View Stereo, ECCV 2016.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,8 @@ from scan2sim.pipeline.core.types import F64
 SEED = 0
 """Seed of all random samples, so that a reconstruction is repeatable."""
 
-
-OVERLAP = 10
-"""Following photos that each is matched with, and about as many at distances of powers of two."""
+MOTION_PAIRS = 2000
+"""Pairs by which the motion of the camera is measured."""
 MIN_ERROR_PX = 0.5
 """Least standard deviation of a feature in a photo."""
 
@@ -34,31 +33,15 @@ class Lens:
     """Lens of a camera as COLMAP needs it.
 
     Attributes:
-        focal: focal length in pixels; None: unknown.
-        centre: principal point; the centre of the top left pixel is (0, 0).
-        distortion: k1, or k1 and k2; None: a pinhole camera without distortion.
+        model: name of the camera model.
+        params: its parameters in COLMAP's order, where pixels begin at their corner; none if the focal length is
+            unknown.
         fixed: whether the mapping keeps it.
     """
 
-    focal: float | None
-    centre: tuple[float, float]
-    distortion: tuple[float, ...] | None = (0.0,)
+    model: str = "SIMPLE_RADIAL"
+    params: tuple[float, ...] = ()
     fixed: bool = False
-
-    @property
-    def model(self) -> str:
-        """Name of the camera model."""
-        if self.distortion is None:
-            return "SIMPLE_PINHOLE"
-        return "SIMPLE_RADIAL" if len(self.distortion) == 1 else "RADIAL"
-
-    @property
-    def params(self) -> str:
-        """Parameters of the camera model; "" if the focal length is unknown. COLMAP's pixels begin at their corner."""
-        if self.focal is None:
-            return ""
-        values = (self.focal, self.centre[0] + 0.5, self.centre[1] + 0.5, *(self.distortion or ()))
-        return ",".join(f"{value:.12g}" for value in values)
 
 
 @dataclass(frozen=True)
@@ -76,7 +59,7 @@ def add_photos(database: Path, images: Path, names: Sequence[str], lens: Lens) -
     import pycolmap
 
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model, reader.camera_params = lens.model, lens.params
+    reader.camera_model, reader.camera_params = lens.model, ",".join(f"{value:.12g}" for value in lens.params)
     with pycolmap.Database.open(database) as opened:
         there = {image.name: image.camera_id for image in opened.read_all_images()}
     missing = [name for name in names if name not in there]
@@ -107,13 +90,6 @@ def extract(database: Path, images: Path, names: Sequence[str], features: int = 
     )
 
 
-def sequential_pairs(names: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Pairs of photos that follow each other up to `OVERLAP` photos apart, and at distances of powers of two."""
-    steps = sorted({*range(1, OVERLAP + 1), *(2**k for k in range(OVERLAP))})
-    for i, name in enumerate(names):
-        yield from ((name, names[i + step]) for step in steps if i + step < len(names))
-
-
 def match(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
     """Match and verify pairs of photos; those matched already are skipped."""
     import pycolmap
@@ -129,20 +105,22 @@ def match(database: Path, pairs: Sequence[tuple[str, str]]) -> None:
 
 
 def displacements(database: Path) -> F64:
-    """Median displacement (K,) of the matched features of each pair of photos, relative to the photo's width."""
+    """Median displacement (K,) of the matched features of pairs of photos, relative to the photo's width.
+
+    Of many pairs, `MOTION_PAIRS` are used.
+    """
     import pycolmap
 
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
         widths = {camera.camera_id: camera.width for camera in opened.read_all_cameras()}
-        keypoints = {key: opened.read_keypoints(key)[:, :2] for key in images}
+        matched = [key for key, count in zip(*opened.read_two_view_geometry_num_inliers(), strict=True) if count]
         found = []
-        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
-            one, other = pycolmap.pair_id_to_image_pair(pair)
-            matches = geometry.inlier_matches
-            if len(matches):
-                moved = keypoints[one][matches[:, 0]] - keypoints[other][matches[:, 1]]
-                found.append(float(np.median(np.linalg.norm(moved, axis=1))) / widths[images[one].camera_id])
+        for key in matched[:: -(-len(matched) // MOTION_PAIRS) or 1]:
+            one, other = pycolmap.pair_id_to_image_pair(key)
+            matches = opened.read_two_view_geometry(one, other).inlier_matches
+            moved = opened.read_keypoints(one)[matches[:, 0], :2] - opened.read_keypoints(other)[matches[:, 1], :2]
+            found.append(float(np.median(np.linalg.norm(moved, axis=1))) / widths[images[one].camera_id])
     return np.array(found)
 
 
@@ -170,6 +148,8 @@ def reconstruct(
     options.max_num_models = 10
     options.ba_refine_principal_point = False
     options.constant_cameras = options.mapper.constant_cameras = set(fixed_cameras)
+    limit = _distortion_limit(database, options.max_extra_param)
+    options.max_extra_param = options.mapper.max_extra_param = options.triangulation.max_extra_param = limit
     options.mapper.init_max_forward_motion = 1
     options.mapper.init_min_tri_angle = 2
     models: dict[int, Any] = pycolmap.incremental_mapping(database, images, out, options)
@@ -182,6 +162,15 @@ def reconstruct(
         error = float(model.compute_mean_reprojection_error())
         found.append(Component(out / str(key), posed, int(model.num_points3D()), error))
     return sorted(found, key=lambda one: (-len(one.names), one.names))
+
+
+def _distortion_limit(database: Path, default: float) -> float:
+    """Distortion coefficient above which COLMAP rejects a camera: those of given lenses (rational ones) are larger."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        given = [camera.params[camera.extra_params_idxs()] for camera in opened.read_all_cameras()]
+    return max([default, *(2 * float(np.abs(values).max()) for values in given if len(values))])
 
 
 def dense_stereo(model: Path, images: Path, workspace: Path, out: Path, max_image_size: int) -> int:
@@ -222,7 +211,8 @@ def precise_points(model: Path) -> tuple[F64, F64]:
 
     found = pycolmap.Reconstruction(model)
     centres = {key: image.projection_center() for key, image in found.images.items()}
-    focal = {key: found.cameras[image.camera_id].mean_focal_length() for key, image in found.images.items()}
+    cameras = {key: found.cameras[image.camera_id] for key, image in found.images.items()}
+    focal = {key: one.mean_focal_length() or one.width / (2 * np.pi) for key, one in cameras.items()}  # 0: a panorama
     points, sigma = [], []
     for point in found.points3D.values():
         seen = [element.image_id for element in point.track.elements]

@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from scan2sim.pipeline.camera import panorama
-from scan2sim.pipeline.core.errors import DataError, InputError, UnavailableError
+from scan2sim.pipeline.core.errors import DataError, InputError, UnavailableError, printable
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.io import file_checks
 from scan2sim.pipeline.io.images import exif, image
 from scan2sim.pipeline.io.images.decoders import heif
-from scan2sim.slam.video import Video, decode, upright
+from scan2sim.slam.video import Video, decode, open_video, upright
 
 COLMAP_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 """Suffixes of photos that COLMAP reads; others are converted for it."""
@@ -30,6 +31,9 @@ UNREAD_SUFFIXES = (
     ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".gpr", ".insp"
 )  # fmt: skip
 """Raw photos, those of 360-degree cameras and rare formats, which aren't read."""
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".insv", ".360")
+SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG", b"II*\0", b"MM\0*", b"BM")
+"""First bytes of the formats of `COLMAP_SUFFIXES`: JPEG, PNG, TIFF, BMP."""
 JPEG_QUALITY = 95
 """Quality of the JPEG files of video frames, 0 to 100."""
 
@@ -44,6 +48,8 @@ class Photo:
         focal: focal length by EXIF, pixels; None if unknown.
         time: seconds: UNIX time by EXIF, or since the first frame of a video; None if unknown.
         zoned: whether `time` is in UTC; otherwise its time zone is unknown.
+        position: latitude and longitude by EXIF, degrees; None if unknown.
+        device: maker, model and lens of the camera by EXIF; "" if unknown.
     """
 
     name: str
@@ -52,11 +58,13 @@ class Photo:
     focal: float | None = None
     time: float | None = None
     zoned: bool = True
+    position: tuple[float, float] | None = None
+    device: str = ""
 
     @property
-    def camera(self) -> tuple[str, int, int, float | None]:
-        """What photos of one camera have in common: folder, size, and focal length by EXIF."""
-        return (self.name.rpartition("/")[0], self.width, self.height, self.focal)
+    def camera(self) -> tuple[str, int, int, float | None, str]:
+        """What photos of one camera have in common: folder, size, and focal length and device by EXIF."""
+        return (self.name.rpartition("/")[0], self.width, self.height, self.focal, self.device)
 
 
 def list_photos(folder: Path) -> list[str]:
@@ -77,7 +85,24 @@ def list_photos(folder: Path) -> list[str]:
 def no_photos(folder: Path) -> InputError:
     """The error of a folder without photos; names those in formats that aren't read."""
     cause, remedy = f"contains no photos ({' '.join(image.SUFFIXES)})", "Give a folder of photos, or a video file"
-    return InputError(folder, cause, remedy) if (left := _unread(folder, ())) is None else InputError(folder, *left)
+    left = _unread(folder, ())
+    if left is None and (videos := _files(folder, VIDEO_SUFFIXES)):
+        cause, remedy = f"contains no photos, but {_counted(videos, 'video')}", "Give the file of one video"
+    return InputError(folder, *(left or (cause, remedy)))
+
+
+def _left_out_videos(folder: Path, names: Sequence[str]) -> str | None:
+    """Warning about videos beside the photos, except those of an iPhone's live photos; None if there are none."""
+    stems = {_stem(name) for name in names}
+    videos = [name for name in _files(folder, VIDEO_SUFFIXES) if _stem(name) not in stems]
+    if not videos:
+        return None
+    return f"{folder.name} has {_counted(videos, 'video')} beside the photos, left out: a video is imported by itself"
+
+
+def _counted(names: Sequence[str], what: str) -> str:
+    listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+    return f"{len(names)} {what}{'s' if len(names) > 1 else ''} ({listed})"
 
 
 def _unread(folder: Path, names: Sequence[str]) -> tuple[str, str] | None:
@@ -119,23 +144,65 @@ def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:
         raise no_photos(folder)
     if (left := _unread(folder, names)) is not None:
         warnings.append(f"{folder.name} {left[0]}; they are left out. {left[1]}")
+    if (videos := _left_out_videos(folder, names)) is not None:
+        warnings.append(videos)
     for i, name in enumerate(names):
         report(i / len(names), name)
         path = folder / name
         try:
+            _check_name(path, name)
             image.check_decodes(path)
-            width, height = image.size_of(path)
+            photos.append(_header(folder, name))
         except (InputError, UnavailableError) as error:
-            warnings.append(f"{name} is skipped: {error.cause}")
-            continue
-        equivalent, taken = exif.focal_35mm(path), exif.time_taken(path)
-        focal = None if equivalent is None else equivalent / FILM_DIAGONAL_MM * math.hypot(width, height)
-        seconds, zoned = taken or (None, True)
-        photos.append(Photo(name, width, height, focal, seconds, zoned))
+            warnings.append(f"{printable(name)} is skipped: {error.cause}")
     if not photos:
         raise InputError(folder, f"none of its {len(names)} photos can be read ({warnings[-1]})", "Copy them again")
     check_count(folder, photos)
     return photos, warnings
+
+
+def _check_name(path: Path, name: str) -> None:
+    """Raise an InputError if a name can't be written into text files."""
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        raise InputError(path, "its name isn't valid UTF-8", "Rename it") from None
+
+
+def read_headers(source: Path) -> list[Photo]:
+    """Photos of a folder whose headers can be read, or the first frame of a video; fast.
+
+    Raises:
+        InputError: the video can't be read.
+    """
+    if source.is_file():
+        video = open_video(source)
+        focal = _focal_px(video.focal_35mm, video.width, video.height)
+        return [Photo("the video", video.width, video.height, focal, 0.0)]
+    photos = []
+    for name in list_photos(source):
+        with suppress(InputError, UnavailableError):  # damaged: skipped and reported when it is read
+            photos.append(_header(source, name))
+    return photos
+
+
+def _header(folder: Path, name: str) -> Photo:
+    """A photo by its header.
+
+    Raises:
+        InputError, UnavailableError: as `image.size_of`.
+    """
+    path = folder / name
+    width, height = image.size_of(path)
+    seconds, zoned = exif.time_taken(path) or (None, True)
+    focal, located = _focal_px(exif.focal_35mm(path), width, height), exif.gps_position(path)
+    position = None if located is None else located[:2]
+    return Photo(name, width, height, focal, seconds, zoned, position, exif.device(path))
+
+
+def _focal_px(equivalent: float | None, width: int, height: int) -> float | None:
+    """Focal length in pixels of a 35 mm equivalent one in millimetres."""
+    return None if equivalent is None else equivalent / FILM_DIAGONAL_MM * math.hypot(width, height)
 
 
 def check_count(source: Path, photos: Sequence[Any]) -> None:
@@ -199,32 +266,28 @@ def extract_frames(
         name = f"{len(photos):06d}.jpg"
         rgb = upright(np.asarray(frame.to_ndarray(format="rgb24"), np.uint8), frame)
         image.write(folder / name, rgb, quality=JPEG_QUALITY)
-        size = (rgb.shape[1], rgb.shape[0])
-        focal = None if video.focal_35mm is None else video.focal_35mm / FILM_DIAGONAL_MM * math.hypot(*size)
-        photos.append(Photo(name, *size, focal, time))
+        height, width = rgb.shape[:2]
+        photos.append(Photo(name, width, height, _focal_px(video.focal_35mm, width, height), time))
     check_count(video.path, photos)
     return photos
 
 
-def check_perspective(source: Path, first: Path, photo: Photo) -> None:
-    """Raise an InputError if photos show the whole sphere, or two fisheye circles: they have no focal length.
+def is_panorama(file: Path, photo: Photo) -> bool:
+    """Whether a photo, stored in `file`, shows the whole sphere: by its metadata, or its edges.
 
-    Args:
-        source: what the user gave: a folder or a video.
-        first: file of the first photo.
-        photo: its metadata.
+    Raises:
+        InputError: it shows two fisheye circles.
     """
-    if photo.width != 2 * photo.height or photo.focal is not None:
-        return
-    grey = image.read_levels(first)
+    if photo.width != 2 * photo.height:
+        return False
+    if exif.is_equirectangular(file):
+        return True
+    if photo.focal is not None:
+        return False
+    grey = image.read_levels(file)
     if panorama.fisheye_pair(grey):
-        raise InputError(source, "shows two fisheye circles side by side, as 360 cameras record them", panorama.STITCH)
-    if panorama.whole_sphere(grey):
-        raise InputError(
-            source, "shows 360 panoramas; here, lenses of perspective photos are solved",
-            "Give the video, or the folder as frames, to `scan2sim slam`, which tracks panoramas. If the photos are "
-            "perspective ones, give --focal (pixels)",
-        )  # fmt: skip
+        raise InputError(file, "shows two fisheye circles side by side, as 360 cameras record them", panorama.STITCH)
+    return panorama.whole_sphere(grey)
 
 
 def stage(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, str]:
@@ -242,15 +305,25 @@ def stage(photos: Sequence[Photo], images: Path, folder: Path) -> dict[str, str]
     staged = {}
     for i, photo in enumerate(photos):
         source = images / photo.name
-        readable = source.suffix.lower() in COLMAP_SUFFIXES
+        readable = _colmap_reads(source)
         target = folder / f"{i:06d}{source.suffix.lower() if readable else '.png'}"
-        target.unlink(missing_ok=True)
-        if readable:
-            file_checks.symlink_or_copy(source, target)
-        else:
-            image.write(target, image.read_rgb(source))
         staged[photo.name] = target.name
+        if readable:
+            target.unlink(missing_ok=True)
+            file_checks.symlink_or_copy(source, target)
+        elif not target.exists():  # else an interrupted run has converted it
+            unfinished = folder / "unfinished.png"
+            image.write(unfinished, image.read_rgb(source))
+            unfinished.replace(target)
     return staged
+
+
+def _colmap_reads(path: Path) -> bool:
+    """Whether COLMAP reads a photo, by its suffix and its content: WebP is often named .jpg."""
+    if path.suffix.lower() not in COLMAP_SUFFIXES:
+        return False
+    with path.open("rb") as file:
+        return file.read(4).startswith(SIGNATURES)
 
 
 def write(path: Path, photos: Sequence[Photo]) -> Path:

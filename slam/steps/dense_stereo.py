@@ -35,8 +35,10 @@ def dense_stereo(inputs: Inputs, params: DenseStereoParams, out: Path, report: R
     File: `cloud`, LAZ in the CRS of `frame`.
 
     Raises:
-        StepError: there is no usable CUDA device. DataError: the photos have no common surfaces.
+        StepError: there is no usable CUDA device. DataError: the photos have no common surfaces or no scale, or are
+            panoramas.
     """
+    _check_usable(inputs["images"], inputs["path"] / "reconstruction.json")
     report(0.0, "dense stereo")
     with tempfile.TemporaryDirectory(dir=out) as folder:
         fused = Path(folder) / "fused.ply"
@@ -57,6 +59,18 @@ def dense_stereo(inputs: Inputs, params: DenseStereoParams, out: Path, report: R
         )
         las.write_parts(out / "cloud.laz", local, software="")
     return Done({"cloud": out / "cloud.laz"}, {"summary": f"dense stereo: {count:,} points", "dense_points": count})
+
+
+def _check_usable(images: Path, summary: Path) -> None:
+    """Raise a DataError if the photos of a reconstruction, described in `summary`, have no scale, or are panoramas."""
+    made = json.loads(summary.read_text(encoding="utf-8"))
+    if not made["georeferenced"]:
+        raise DataError(
+            images, "GPS doesn't give the scale of its photos, so that a tile would have a wrong size",
+            "Give --gps TRACK or --cloud; the warnings above say what is wrong with the GPS in the photos",
+        )  # fmt: skip
+    if any(lens["model"] == "equirectangular" for lens in made["lenses"].values()):
+        raise DataError(images, "shows panoramas, from which COLMAP's dense stereo makes no cloud", "Give --cloud")
 
 
 DENSE_STEREO = Step("dense_stereo", 1, dense_stereo, DenseStereoParams, memory=(4, 2))

@@ -21,6 +21,7 @@ from scan2sim.pipeline.geometry.similarity import Similarity
 from scan2sim.pipeline.importers import georeference
 from scan2sim.pipeline.io import clouds as cloud_io
 from scan2sim.pipeline.io.geodata import crs as crs_io
+from scan2sim.pipeline.io.images import exif
 from scan2sim.pipeline.io.photogrammetry import Model, Photos
 from scan2sim.pipeline.io.photogrammetry import colmap as model_io
 from scan2sim.pipeline.pose_check import photo_fit
@@ -36,6 +37,8 @@ from scan2sim.slam.video import open_video
 
 CSV_COLUMNS = ("model", "width", "height", "fx", "fy", "cx", "cy")
 COEFFICIENTS = {"opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
+QUARTER_TURNS = {3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
+"""Clockwise quarter turns by which a photo is displayed, by the orientation in its EXIF."""
 MAX_HEADING_SIGMA_RAD = np.radians(12.0)
 """Standard deviation of the heading by GPS that the registration to a cloud can correct."""
 
@@ -106,7 +109,7 @@ class PlaceParams(Placed):
 def place_photos(inputs: Inputs, params: PlaceParams, out: Path, report: Report) -> Done:
     """Scale and georeference `model` with `photos` (JSON) of the folder `images`, by `gps`, `positions`, or EXIF.
 
-    With `cloud`, the reconstruction is registered to it. Without approximate positions it keeps its arbitrary scale.
+    With `cloud`, the reconstruction is registered to it. Without usable positions it keeps its arbitrary scale.
     `video` is the source of the images, if it is one. `summary` (JSON) is written to `path`,
     with this step's metrics. Files: `table` (CSV of posed photos as `import clouds` reads it),
     `path` (trajectory in all formats, and the COLMAP model, local metres), `frame` (JSON of the local frame).
@@ -118,22 +121,21 @@ def place_photos(inputs: Inputs, params: PlaceParams, out: Path, report: Report)
     model = model_io.read(inputs["model"], Photos(images))
     known = {photo.name: photo for photo in photos_io.read(inputs["photos"])}
     photos = [known[shot.file] for shot in model.shots]
-    ups = np.array([-shot.pose[:3, 1] for shot in model.shots])
+    seen = displayed(model, images)
+    ups = -seen[:, :3, 1]
     warnings: list[str] = []
     cloud = inputs.get("cloud")
-    found = approximate(inputs, photos, params)
-    metrics: dict[str, Any] = {"georeferenced": found is not None}
-    if found is None:
-        R = upright(np.array([shot.pose for shot in model.shots]))
+    found = approximate(inputs, photos, params, warnings.append)
+    fit = None if found is None else georeferenced(found, model, ups, inputs, warnings.append)
+    metrics: dict[str, Any] = {"georeferenced": fit is not None}
+    if found is None or fit is None:
+        R = upright(seen)
         onto, frame = Similarity(1.0, R, -R @ model.centres[0]), Frame()
-        warnings.append("without GPS, scale and position of the photos are unknown: trajectory.csv isn't in metres")
+        warnings.append(
+            "without usable GPS, scale and position of the photos are unknown: trajectory.csv isn't in metres"
+        )
     else:
         warnings += found.notes
-        fit = georeference.from_positions(
-            images, model.centres, ups, found.xyz, found.crs, found.unit,
-            max_angle=georeference.MAX_ANGLE_SIGMA_RAD if cloud is None else MAX_HEADING_SIGMA_RAD,
-            remedy="or give more accurate positions",
-        )  # fmt: skip
         assert fit.rms is not None
         metrics |= {"gps_rms_m": round(fit.rms, 3), "crs": crs_io.name(found.crs), "scale": fit.onto.scale * found.unit}
         origin = np.floor(fit.onto.apply(model.centres).mean(axis=0) * found.unit)
@@ -170,8 +172,27 @@ def place_photos(inputs: Inputs, params: PlaceParams, out: Path, report: Report)
     return Done({"table": table, "path": path, "frame": frame_file}, metrics, warnings)
 
 
-def approximate(inputs: Inputs, photos: Sequence[Photo], params: PlaceParams) -> Positions | None:
-    """Approximate positions of the photos, None if there are none; their CRS is that of the cloud, if any.
+def displayed(model: Model, images: Path) -> F64:
+    """Poses (P, 4, 4) of the photos as they are displayed, camera to model: portraits may be stored on their side."""
+    from scipy.spatial.transform import Rotation
+
+    poses = np.array([shot.pose for shot in model.shots])
+    turns = [QUARTER_TURNS.get(exif.orientation(images / shot.file), 0) for shot in model.shots]
+    poses[:, :3, :3] = (
+        poses[:, :3, :3] @ Rotation.from_euler("z", -90.0 * np.array(turns)[:, None], degrees=True).as_matrix()
+    )
+    return poses
+
+
+def approximate(
+    inputs: Inputs, photos: Sequence[Photo], params: PlaceParams, warn: Callable[[str], None]
+) -> Positions | None:
+    """Approximate positions of the photos; their CRS is that of the cloud, if any.
+
+    Without a cloud, photos without GPS aren't an error: `warn` receives the reason.
+
+    Returns:
+        None if there are none.
 
     Raises:
         ScanError: as functions of `slam.reconstruction.positions`.
@@ -184,9 +205,35 @@ def approximate(inputs: Inputs, photos: Sequence[Photo], params: PlaceParams) ->
         return positions_io.by_track(inputs["gps"], photos, crs, start, params.gps_offset)
     try:
         return positions_io.by_exif(inputs["images"], photos, crs)
-    except DataError:
+    except DataError as error:
         if "cloud" in inputs:
             raise
+        if any(photo.position for photo in photos):
+            warn(error.cause)
+        return None
+
+
+def georeferenced(
+    found: Positions, model: Model, ups: F64, inputs: Inputs, warn: Callable[[str], None]
+) -> georeference.Fit | None:
+    """Similarity of a reconstruction to its approximate positions.
+
+    The GPS that happens to be in the photos may be of one spot: `warn` receives the reason, and the result is None.
+    For a cloud, or by positions that the user gives, that is an error.
+
+    Raises:
+        DataError: the positions are inconsistent, or too near to each other for their errors.
+    """
+    try:
+        return georeference.from_positions(
+            inputs["images"], model.centres, ups, found.xyz, found.crs, found.unit,
+            max_angle=MAX_HEADING_SIGMA_RAD if "cloud" in inputs else georeference.MAX_ANGLE_SIGMA_RAD,
+            remedy="or give more accurate positions",
+        )  # fmt: skip
+    except DataError as error:
+        if not inputs.keys().isdisjoint(("cloud", "gps", "positions")):
+            raise
+        warn(f"the GPS in the photos isn't used: {error.cause}")
         return None
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,14 +12,16 @@ import numpy as np
 from pydantic import Field
 
 from scan2sim.pipeline.core import sandbox
-from scan2sim.pipeline.core.errors import DataError, SettingError, StepError
+from scan2sim.pipeline.core.errors import DataError, StepError
 from scan2sim.pipeline.core.optional_deps import require
-from scan2sim.pipeline.core.parameters import Focal, Pixels, Rate
-from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
+from scan2sim.pipeline.core.parameters import Rate
+from scan2sim.pipeline.core.step import Done, Inputs, Report, Step
 from scan2sim.pipeline.io.file_checks import copy_tree
 from scan2sim.pipeline.io.photogrammetry import colmap as model_io
 from scan2sim.slam.reconstruction import colmap
 from scan2sim.slam.reconstruction import photos as photos_io
+from scan2sim.slam.reconstruction.lenses import LensParams, by_camera, contradictions, lenses
+from scan2sim.slam.reconstruction.pairs import all_pairs, following_pairs, near_pairs, unique
 from scan2sim.slam.reconstruction.photos import Photo
 from scan2sim.slam.video import open_video
 
@@ -34,23 +35,14 @@ than a mast shakes in the wind, less than distant photos of a camera that moves.
 CALL = "scan2sim.slam.reconstruction.colmap:"
 
 
-class Reconstructed(Params):
+class Reconstructed(LensParams):
     """Lens, matching and limits of a reconstruction: the options of `scan2sim import images`."""
 
-    focal: Focal | None = Field(
-        None, description="Focal length in pixels, which is kept; default: from EXIF and refined, or solved."
-    )
-    centre: tuple[Pixels, Pixels] | None = Field(
-        None, description="Principal point in pixels; default: the image centre."
-    )
-    k1: Annotated[float, Field(ge=-1, le=1)] | None = Field(
-        None, description="Radial distortion k1 (OpenCV model); default: solved, or 0 if --focal is given."
-    )
-    refine_lens: bool = Field(False, description="Refine the given focal length and k1.")
     matching: Literal["auto", "sequential", "exhaustive"] = Field(
         "auto",
         description="Photos to match: with the following ones (sequential: videos, photos in order), or all pairs "
-        f"(exhaustive); auto: exhaustive up to {EXHAUSTIVE_MAX} photos.",
+        f"(exhaustive); auto: exhaustive up to {EXHAUSTIVE_MAX} photos, else with the following ones and the nearest "
+        "ones by the GPS in their EXIF.",
     )
     fps: Rate = Field(5.0, description="Frames per second to take from a video.")
     until: Annotated[float, Field(ge=0, le=1e7)] = Field(
@@ -60,13 +52,14 @@ class Reconstructed(Params):
         8192, description="Greatest number of features per photo."
     )
     time_limit: Annotated[float, Field(ge=0.01, le=1000)] = Field(
-        12.0, description="Hours after which COLMAP's mapping ends with an error."
+        12.0, exclude=True, description="Hours after which COLMAP's mapping ends with an error."
     )
 
 
 def reconstruct(inputs: Inputs, params: Reconstructed, out: Path, report: Report, checkpoint: Path) -> Done:
-    """Reconstruct the photos in `photos`, a folder or a video, with optional `times` (seconds, one per line).
+    """Reconstruct the photos in `photos`, a folder or a video.
 
+    Optional inputs: `times` (seconds, one per line), `camera` (calibration file).
     Files: `model` (COLMAP's binary format; its unit is arbitrary), `photos` and `summary` (JSON), `frames` of a video.
 
     Raises:
@@ -85,15 +78,19 @@ def reconstruct(inputs: Inputs, params: Reconstructed, out: Path, report: Report
         photos, warnings = photos_io.read_photos(source, part(report, 0, 0.1))
         if "times" in inputs:
             photos = photos_io.with_times(photos, photos_io.list_photos(source), inputs["times"])
-    if params.focal is None:
-        photos_io.check_perspective(source, images / photos[0].name, photos[0])
+    given = lenses(source, photos, params, inputs.get("camera"), images)
+    warnings += contradictions(photos, given)
     database, staged = checkpoint / "database.db", checkpoint / "images"
     names = photos_io.stage(photos, images, staged)
-    fixed = _extract(database, staged, photos, names, params, part(report, 0.1, 0.4))
+    cameras = list(zip(by_camera(photos), given, strict=True))
+    fixed = _extract(database, staged, cameras, names, params, part(report, 0.1, 0.4))
     exhaustive = params.matching == "exhaustive" or (
         params.matching == "auto" and not is_video and len(photos) <= EXHAUSTIVE_MAX
     )
-    pairs = [(names[a], names[b]) for a, b in (all_pairs(photos) if exhaustive else following_pairs(photos))]
+    chosen = list(all_pairs(photos)) if exhaustive else following_pairs(photos)
+    if params.matching == "auto" and not exhaustive:
+        chosen = unique([*chosen, *near_pairs(photos)])
+    pairs = [(names[one], names[other]) for one, other in chosen]
     for at in range(0, len(pairs), MATCH_CHUNK):
         part(report, 0.4, 0.7)(at / len(pairs), f"matching pair {at + 1} of {len(pairs)}")
         _call("match", database, pairs[at : at + MATCH_CHUNK], hours=params.time_limit)
@@ -119,7 +116,7 @@ def reconstruct(inputs: Inputs, params: Reconstructed, out: Path, report: Report
         "lenses": _lenses(out / "model", images),
     }  # fmt: skip
     if left_out:
-        warnings.append(_left_out(found, left_out, photos))
+        warnings.append(_left_out(found, left_out, photos, exhaustive))
     summary = out / "reconstruction.json"
     summary.write_text(json.dumps(metrics, indent=1), encoding="utf-8")
     files = {"model": out / "model", "summary": summary, "photos": photos_io.write(out / "photos.json", photos)}
@@ -135,58 +132,26 @@ def part(report: Report, start: float, end: float) -> Report:
     return within
 
 
-def all_pairs(photos: Sequence[Photo]) -> Iterator[tuple[str, str]]:
-    """Names of all pairs of photos."""
-    for i, one in enumerate(photos):
-        for other in photos[i + 1 :]:
-            yield one.name, other.name
-
-
-def following_pairs(photos: Sequence[Photo]) -> Iterator[tuple[str, str]]:
-    """Names of pairs of photos that follow each other, by time if known; cameras, by folder, run in parallel."""
-    groups: dict[str, list[Photo]] = defaultdict(list)
-    for photo in photos:
-        groups[photo.name.rpartition("/")[0]].append(photo)
-    timed = all(photo.time is not None for photo in photos)
-    runs = [sorted(group, key=lambda photo: photo.time or 0.0) if timed else group for group in groups.values()]
-    for k, run in enumerate(runs):
-        yield from colmap.sequential_pairs([photo.name for photo in run])
-        for i, photo in enumerate(run):
-            for other in runs[k + 1 :]:
-                yield from ((photo.name, other[j].name) for j in range(max(0, i - 2), min(len(other), i + 3)))
-
-
 def _extract(
     database: Path,
     images: Path,
-    photos: Sequence[Photo],
+    cameras: Sequence[tuple[Sequence[Photo], colmap.Lens]],
     names: Mapping[str, str],
     params: Reconstructed,
     report: Report,
 ) -> list[int]:
     """Extract the features of all photos, files `names` in `images`; returns the ids of cameras with fixed lenses."""
-    groups: dict[Any, list[Photo]] = defaultdict(list)
-    for photo in photos:
-        groups[photo.camera].append(photo)
-    fixed, done = [], 0
-    for group in groups.values():
-        files, lens = [names[photo.name] for photo in group], lens_of(group[0], params)
+    fixed, done, total = [], 0, sum(len(group) for group, _ in cameras)
+    for group, lens in cameras:
+        files = [names[photo.name] for photo in group]
         camera: int = _call("add_photos", database, images, files, lens, hours=params.time_limit)
         if lens.fixed:
             fixed.append(camera)
         for at in range(0, len(group), EXTRACT_CHUNK):
-            report(done / len(photos), f"features of {group[at].name} ({done} of {len(photos)})")
+            report(done / total, f"features of {group[at].name} ({done} of {total})")
             _call("extract", database, images, files[at : at + EXTRACT_CHUNK], params.features, hours=params.time_limit)
             done += len(files[at : at + EXTRACT_CHUNK])
     return fixed
-
-
-def lens_of(photo: Photo, params: Reconstructed) -> colmap.Lens:
-    """Lens of a photo by the options, or by EXIF."""
-    centre = params.centre or ((photo.width - 1) / 2, (photo.height - 1) / 2)
-    if params.focal is None:
-        return colmap.Lens(photo.focal, centre, (params.k1 or 0.0,))
-    return colmap.Lens(params.focal, centre, (params.k1 or 0.0,), fixed=not params.refine_lens)
 
 
 def _call(function: str, *arguments: Any, hours: float) -> Any:
@@ -196,7 +161,8 @@ def _call(function: str, *arguments: Any, hours: float) -> Any:
     except StepError as error:
         raise StepError(
             f"COLMAP ({function})", error.cause,
-            "Run again to resume, with fewer photos (every second one), less --features, or a longer --time-limit",
+            "Run again to resume, also with a longer --time-limit; or give fewer photos (every second one), or less "
+            "--features",
         ) from None  # fmt: skip
 
 
@@ -222,32 +188,39 @@ def _no_model(source: Path, exhaustive: bool) -> DataError:
     )  # fmt: skip
 
 
-def _left_out(found: Sequence[colmap.Component], left_out: Sequence[str], photos: Sequence[Photo]) -> str:
+def _left_out(
+    found: Sequence[colmap.Component], left_out: Sequence[str], photos: Sequence[Photo], exhaustive: bool
+) -> str:
     """Warning about photos without a pose."""
     others = "; ".join(f"{one.names[0]} to {one.names[-1]} ({len(one.names)})" for one in found[1:])
     parts = f", in {len(found) - 1} separate parts among others: {others}" if others else ""
     names = ", ".join(left_out[:10]) + (", ..." if len(left_out) > 10 else "")
-    return f"{len(left_out)} of {len(photos)} photos don't connect to the others and are left out{parts}: {names}"
+    remedy = "" if exhaustive else "; if they are not in order, --matching exhaustive compares all of them"
+    return (
+        f"{len(left_out)} of {len(photos)} photos don't connect to the others and are left out{parts}: {names}{remedy}"
+    )
 
 
 def _lenses(model: Path, images: Path) -> dict[str, Any]:
-    """Focal length and distortion of each camera."""
+    """Model, focal length and distortion of each camera."""
     from scan2sim.pipeline.io.photogrammetry import Photos
 
     cameras = model_io.read(model, Photos(images)).cameras
     return {
-        name: {"focal": round(one.fx, 2), "k1": round(one.distortion[0], 5) if one.distortion else 0.0}
+        name: {
+            "model": one.model,
+            "focal": round(one.fx, 2),
+            "k1": round(one.distortion[0], 5) if one.distortion else 0.0,
+        }
         for name, one in cameras.items()
     }
 
 
 def can_reconstruct(params: Reconstructed) -> None:
-    """Raise an UnavailableError where pycolmap isn't installed, a SettingError if options contradict each other."""
+    """Raise an UnavailableError where pycolmap isn't installed."""
     require("import images", "pycolmap")
-    if params.refine_lens and params.focal is None:
-        raise SettingError("--refine-lens", "there is no lens to refine", "Give --focal, or leave it out")
 
 
 RECONSTRUCT = Step(
-    "reconstruct", 2, reconstruct, Reconstructed, check=can_reconstruct, resumes=True, memory=(1.5, 0)
+    "reconstruct", 3, reconstruct, Reconstructed, check=can_reconstruct, resumes=True, memory=(1.5, 0)
 )  # fmt: skip

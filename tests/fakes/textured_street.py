@@ -8,12 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
+from scan2sim.pipeline.camera.models import pixel_rays
+from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, PointCloud
 from scan2sim.pipeline.io.clouds import las
 
 TEXEL_M = 0.03
 SIZE = (480, 360)
 FOCAL = 400.0
+CAMERA = Camera("pinhole", *SIZE, FOCAL, FOCAL, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
 
 
 @dataclass(frozen=True)
@@ -74,12 +76,9 @@ def poses(count: int = 9, spacing: float = 1.2) -> F64:
     return found
 
 
-def render(quads: list[Quad], pose: F64) -> U8:
+def render(quads: list[Quad], pose: F64, camera: Camera = CAMERA) -> U8:
     """Grey photo (H, W)."""
-    width, height = SIZE
-    column, row = np.meshgrid(np.arange(width), np.arange(height))
-    rays = np.stack([(column - (width - 1) / 2) / FOCAL, (row - (height - 1) / 2) / FOCAL, np.ones(column.shape)], -1)
-    rays = rays.reshape(-1, 3) @ pose[:3, :3].T
+    rays = pixel_rays(camera).reshape(-1, 3).astype(np.float64) @ pose[:3, :3].T
     nearest, grey = np.full(len(rays), np.inf), np.full(len(rays), 200, np.uint8)
     for quad in quads:
         normal = np.cross(quad.u, quad.v)
@@ -91,7 +90,7 @@ def render(quads: list[Quad], pose: F64) -> U8:
         h, w = quad.texture.shape
         grey[seen] = quad.texture[(b[seen] * h).astype(int), (a[seen] * w).astype(int)]
         nearest[seen] = depth[seen]
-    return cv2.GaussianBlur(grey.reshape(height, width), (0, 0), 0.7)
+    return cv2.GaussianBlur(grey.reshape(camera.height, camera.width), (0, 0), 0.7)
 
 
 def cloud(quads: list[Quad], frame: Frame, spacing: float = 0.1) -> PointCloud:
@@ -109,11 +108,16 @@ def cloud(quads: list[Quad], frame: Frame, spacing: float = 0.1) -> PointCloud:
     return PointCloud(frame, xyz.astype(np.float32), intensity=values.astype(np.uint16) * 200)
 
 
-def write(folder: Path, frame: Frame, count: int = 9) -> F64:
+def write(folder: Path, frame: Frame, count: int = 9, camera: Camera = CAMERA) -> F64:
     """Write `photos/00.jpg` ... and `cloud.laz`; returns the poses (P, 4, 4), camera to the local frame."""
-    (folder / "photos").mkdir(parents=True)
     quads, T = street(), poses(count)
     for i, pose in enumerate(T):
-        cv2.imwrite(str(folder / "photos" / f"{i:02d}.jpg"), render(quads, pose), [cv2.IMWRITE_JPEG_QUALITY, 95])
+        write_photo(folder / "photos" / f"{i:02d}.jpg", quads, pose, camera)
     las.write(folder / "cloud.laz", cloud(quads, frame))
     return T
+
+
+def write_photo(path: Path, quads: list[Quad], pose: F64, camera: Camera = CAMERA) -> None:
+    """Write a photo as JPEG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), render(quads, pose, camera), [cv2.IMWRITE_JPEG_QUALITY, 95])

@@ -111,6 +111,25 @@ def test_photos_in_subfolders_are_read_again_when_they_change(street: tuple[Path
     assert plan(build_graph(source, Path()), store)[0].key != before[0]
 
 
+def test_features_and_matches_are_kept_with_a_longer_time_limit(street: tuple[Path, F64], tmp_path: Path) -> None:
+    store, photos = Store(tmp_path / "store"), street[0] / "photos"
+    keys = [
+        plan(build_graph(Images.model_validate({"photos": photos, **given}), Path()), store)[0].key
+        for given in ({}, {"time_limit": 48}, {"features": 500})
+    ]
+    assert keys[0] == keys[1] != keys[2]
+
+
+def test_another_calibration_reconstructs_the_photos_again(street: tuple[Path, F64], tmp_path: Path) -> None:
+    store, file, keys = Store(tmp_path / "store"), tmp_path / "camera.toml", list[str]()
+    for focal in (400, 401):
+        text = f'[[cameras]]\nid = "a"\nmodel = "pinhole"\nsize = [480, 360]\nfocal = [{focal}, {focal}]\n'
+        file.write_text(text + "centre = [239.5, 179.5]\n", encoding="utf-8")
+        source = Images.model_validate({"photos": street[0] / "photos", "camera": str(file), "refine_lens": True})
+        keys.append(plan(build_graph(source, Path()), store)[0].key)
+    assert keys[0] != keys[1]
+
+
 def test_a_tile_inside_the_folder_of_its_photos_is_refused(street: tuple[Path, F64], tmp_path: Path) -> None:
     photos = tmp_path / "photos"
     shutil.copytree(street[0] / "photos", photos)
@@ -131,6 +150,12 @@ def test_missing_inputs_are_reported_before_anything_is_computed(street: tuple[P
     single.mkdir()
     shutil.copy(photos / "00.jpg", single)
     local = (*cloud, "--crs", "local")
+    calibration = tmp_path / "camera.yaml"
+    calibration.write_text(
+        "image_width: 960\nimage_height: 720\ncamera_matrix: {data: [800, 0, 480, 0, 800, 360, 0, 0, 1]}\n"
+        "distortion_model: plumb_bob\ndistortion_coefficients: {data: [0.1, 0, 0, 0, 0]}\n",
+        encoding="utf-8",
+    )
     cases: list[tuple[tuple[object, ...], type[Exception], str]] = [
         ((tmp_path / "none",), InputError, "not found"),
         ((empty,), InputError, "no photos"),
@@ -140,6 +165,10 @@ def test_missing_inputs_are_reported_before_anything_is_computed(street: tuple[P
         ((photos, *cloud, "--gps", folder / "gps.csv"), DataError, "00.jpg has no time"),
         ((photos, *cloud, *gps, "--positions", folder / "gps.csv"), SettingError, "both"),
         ((photos, "--refine-lens"), SettingError, "no lens"),
+        ((photos, "--camera", tmp_path / "camera.toml"), InputError, "file not found"),
+        ((photos, "--camera", calibration), InputError, "no camera of 480x360, the size of 00.jpg and 7 other photos"),
+        ((photos, "--camera", calibration, "--focal", "400"), SettingError, "beside a file with the camera"),
+        ((photos, "--k1", "0.1"), SettingError, "needs a focal length"),
     ]
     for words, kind, text in cases:
         failed = command(*words, "--out", out)

@@ -17,7 +17,7 @@ from scan2sim.pipeline.io.calibration import camera_of_photos
 from scan2sim.pipeline.io.images.image import read_levels
 from scan2sim.pipeline.io.images.video import Encoder
 from scan2sim.slam.calibration.camera import camera_of
-from scan2sim.slam.reconstruction.photos import Photo, check_perspective, extract_frames
+from scan2sim.slam.reconstruction.photos import Photo, extract_frames, is_panorama
 from scan2sim.slam.video import open_video
 from tests.slam.conftest import Drive
 
@@ -66,18 +66,15 @@ def test_camera_of_wide_frames_is_only_assumed_if_they_show_the_whole_sphere(cor
     assert chosen is not None and chosen.model == "equirectangular"
 
 
-def test_panoramas_are_no_photos_for_a_perspective_reconstruction(corridor: Drive, tmp_path: Path) -> None:
+def test_photos_are_panoramas_if_they_show_the_whole_sphere(corridor: Drive, tmp_path: Path) -> None:
     path = tmp_path / "0.png"
-    for grey, cause in (
-        (corridor.greys[0], "360 panoramas.*scan2sim slam"),
-        (fisheyes(corridor.greys[0]), "fisheye circles"),
-    ):
-        cv2.imwrite(str(path), grey)
-        with pytest.raises(InputError, match=cause):
-            check_perspective(tmp_path, path, Photo("0.png", 256, 128))
-    check_perspective(tmp_path, path, Photo("0.png", 256, 128, focal=200.0))
+    cv2.imwrite(str(path), corridor.greys[0])
+    assert is_panorama(path, Photo("0.png", 256, 128)) and not is_panorama(path, Photo("0.png", 256, 128, focal=200.0))
     cv2.imwrite(str(path), perspective(corridor.greys[0]))
-    check_perspective(tmp_path, path, Photo("0.png", 256, 128))
+    assert not is_panorama(path, Photo("0.png", 256, 128))
+    cv2.imwrite(str(path), fisheyes(corridor.greys[0]))
+    with pytest.raises(InputError, match="fisheye circles"):
+        is_panorama(path, Photo("0.png", 256, 128))
 
 
 @pytest.mark.parametrize("name", ["VID_0001.insv", "GS010001.360"])

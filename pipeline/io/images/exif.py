@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,11 @@ GPS, EXIF = 0x8825, 0x8769  # tags of the two sub-directories (IFD)
 LATITUDE_REF, LATITUDE, LONGITUDE_REF, LONGITUDE, ALTITUDE_REF, ALTITUDE = 1, 2, 3, 4, 5, 6
 FOCAL, FOCAL_35MM, ORIGINAL_WIDTH, FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 37386, 41989, 40962, 41486, 41488
 ORIENTATION = 274
+MAKER, MODEL, LENS_MODEL = 271, 272, 42036
 TAKEN, OFFSET, FRACTION = 36867, 36881, 37521  # DateTimeOriginal, OffsetTimeOriginal, SubSecTimeOriginal
+XMP_BYTES = 2**18
+"""Length of the part of a file that has its XMP: XMP and previews are before the pixels."""
+EQUIRECTANGULAR = re.compile(rb"""GPano:ProjectionType\s*[=>]\s*["']?\s*equirectangular""")
 UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0}
 """Millimetres of the units in which EXIF gives the resolution of the focal plane."""
 
@@ -79,6 +84,23 @@ def orientation(photo: Path) -> int:
     except Exception:  # as above
         return 1
     return value if 1 <= value <= 8 else 1
+
+
+def device(photo: Path) -> str:
+    """Maker, model and lens of the camera, as one text; "" if EXIF doesn't have them."""
+    try:
+        with _opened(photo) as image:
+            tags = image.getexif()
+            names = (tags.get(MAKER), tags.get(MODEL), tags.get_ifd(EXIF).get(LENS_MODEL))
+        return " ".join(str(name).strip(" \0") for name in names if name)
+    except Exception:  # as above
+        return ""
+
+
+def is_equirectangular(photo: Path) -> bool:
+    """Whether XMP says that a photo is an equirectangular panorama (https://developers.google.com/streetview/spherical-metadata)."""
+    with photo.open("rb") as file:
+        return EQUIRECTANGULAR.search(file.read(XMP_BYTES)) is not None
 
 
 def _degrees(value: Any) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from scan2sim.pipeline.core import sandbox
-from scan2sim.pipeline.core.errors import StepError
+from scan2sim.pipeline.core.errors import DataError, StepError
 from scan2sim.pipeline.core.step import silent
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.io import clouds
@@ -21,7 +21,9 @@ FRAME = Frame("EPSG:32633", (391000.0, 5820000.0, 40.0))
 XYZ = np.random.default_rng(0).uniform(-20, 20, (50, 3))
 
 
-def inputs(folder: Path) -> dict[str, Path]:
+def inputs(folder: Path, model: str = "opencv", *, georeferenced: bool = True) -> dict[str, Path]:
+    made = {"georeferenced": georeferenced, "lenses": {"camera_1": {"model": model}}}
+    (folder / "reconstruction.json").write_text(json.dumps(made), encoding="utf-8")
     (folder / "frame.json").write_text(json.dumps(asdict(FRAME)), encoding="utf-8")
     return {"path": folder, "images": folder, "frame": folder / "frame.json"}
 
@@ -51,3 +53,10 @@ def test_failure_names_the_cloud_option(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "out").mkdir()
     with pytest.raises(StepError, match="no CUDA device. Give --cloud"):
         dense_stereo(inputs(tmp_path), DenseStereoParams(), tmp_path / "out", silent)
+
+
+def test_photos_without_scale_and_panoramas_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="GPS doesn't give the scale.*--cloud"):
+        dense_stereo(inputs(tmp_path, georeferenced=False), DenseStereoParams(), tmp_path, silent)
+    with pytest.raises(DataError, match="shows panoramas.*--cloud"):
+        dense_stereo(inputs(tmp_path, "equirectangular"), DenseStereoParams(), tmp_path, silent)

@@ -10,7 +10,8 @@ import pytest
 from scan2sim.pipeline.core.errors import DataError, InputError
 from scan2sim.pipeline.core.types import GpsTrack
 from scan2sim.slam.reconstruction.photos import Photo
-from scan2sim.slam.reconstruction.positions import by_list, by_track, shifted
+from scan2sim.slam.reconstruction.positions import by_list, by_track, check_sources, shifted
+from tests.fakes import exif_photos
 
 NOON = 1_700_000_000.0
 TRACK = GpsTrack(NOON + np.arange(60.0), np.column_stack([np.arange(60.0), np.zeros(60), np.zeros(60)]))
@@ -69,3 +70,45 @@ def test_rough_positions_are_read_from_a_list(tmp_path: Path) -> None:
         path.write_text(text, encoding="utf-8")
         with pytest.raises(InputError, match=cause):
             by_list(path, photos([None, None, None]), "local")
+
+
+def test_photos_without_a_time_are_left_out_of_those_that_a_track_locates(tmp_path: Path) -> None:
+    found = by_track(write(tmp_path / "gps.csv"), photos([NOON + 10, None, NOON + 20, NOON + 30]), None, None, None)
+    assert np.allclose(found.xyz[[0, 2, 3], 0], [10, 20, 30], atol=0.05) and np.isnan(found.xyz[1]).all()
+    assert any("1 photos have no time" in note for note in found.notes)
+
+
+def test_a_track_of_another_day_is_an_error_before_anything_is_computed(tmp_path: Path) -> None:
+    track, folder = write(tmp_path / "gps.csv"), tmp_path / "photos"
+    for i in range(4):
+        exif_photos.write(folder / f"{i}.jpg", time=NOON + 10 * i)
+    assert check_sources(folder, gps=track)
+    (tmp_path / "times.txt").write_text("".join(f"{NOON + 86400 + i}\n" for i in range(4)), encoding="utf-8")
+    with pytest.raises(DataError, match="covers the times of 0 of 4 photos"):
+        check_sources(folder, gps=track, times=tmp_path / "times.txt")
+    assert check_sources(folder, gps=track, times=tmp_path / "times.txt", offset=86400.0)
+
+
+def test_a_list_is_checked_before_anything_is_computed(tmp_path: Path) -> None:
+    folder, path = tmp_path / "photos", tmp_path / "rough.csv"
+    for name in ("0.jpg", "links/Strau\N{LATIN SMALL LETTER SHARP S} u\u0308.jpg", "2.jpg"):
+        exif_photos.write(folder / name)
+    row = "{},1,2,3\n".format
+    umlaut = "links\\Strau\N{LATIN SMALL LETTER SHARP S} \N{LATIN SMALL LETTER U WITH DIAERESIS}.jpg"
+    path.write_text("file,x,y,z\n" + row("0.jpg") + row(umlaut) + row("2.jpg"), encoding="utf-8")
+    assert check_sources(folder, positions=path)
+    for rows, cause in (
+        (row("0.jpg") + row("7.jpg"), "names 7.jpg, which photos doesn't have"),
+        (row("0.jpg"), "of 1 photos"),
+    ):
+        path.write_text("file,x,y,z\n" + rows, encoding="utf-8")
+        with pytest.raises(InputError, match=cause):
+            check_sources(folder, positions=path)
+
+
+def test_positions_of_photos_without_a_pose_are_ignored(tmp_path: Path) -> None:
+    path = tmp_path / "rough.csv"
+    path.write_text("file,x,y,z\n2.jpg,1,2,3\nlost.jpg,9,9,9\n0.jpg,4,5,6\n", encoding="utf-8")
+    found = by_list(path, photos([None, None, None]), "local")
+    assert np.allclose(found.xyz[[0, 2]], [[4, 5, 6], [1, 2, 3]])
+    assert "photos without a pose: lost.jpg" in found.notes[0]

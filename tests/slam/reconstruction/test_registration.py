@@ -6,7 +6,6 @@ import numpy as np
 
 from scan2sim.pipeline.core.types import Frame
 from scan2sim.pipeline.geometry.similarity import Similarity
-from scan2sim.slam.reconstruction.colmap import sequential_pairs
 from scan2sim.slam.reconstruction.registration import candidates, climb, moved
 from scan2sim.slam.scan_pairs import surface_of
 from tests.fakes import textured_street
@@ -34,9 +33,3 @@ def test_hill_climbing_finds_the_maximum_of_a_score() -> None:
 
     best, _ = climb(score, TRUE, middle, 15.0, (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.01))
     assert np.linalg.norm(best.apply(CENTRES) - goal.apply(CENTRES), axis=1).max() < 0.05
-
-
-def test_pairs_of_a_sequence_connect_neighbours_and_distant_photos_once() -> None:
-    pairs = list(sequential_pairs([str(i) for i in range(100)]))
-    assert len(pairs) == len(set(pairs)) < 100 * 14
-    assert {("0", "1"), ("0", "10"), ("0", "64"), ("98", "99")} <= set(pairs) and ("0", "11") not in pairs
