@@ -151,7 +151,10 @@ def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:
         path = folder / name
         try:
             _check_name(path, name)
-            image.check_decodes(path)
+            if _colmap_reads(path):
+                image.check_decodes(path)
+            else:
+                image.read_levels(path)  # it will be converted
             photos.append(_header(folder, name))
         except (InputError, UnavailableError) as error:
             warnings.append(f"{printable(name)} is skipped: {error.cause}")
