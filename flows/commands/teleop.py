@@ -22,6 +22,7 @@ from scan2sim.flows.commands.ros_spin import stop_on_signal
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import DataError, SettingError
 from scan2sim.pipeline.io.worlds.scene import read_scene
+from scan2sim.services.teleoperation.access.drivers import DriverRole
 from scan2sim.services.teleoperation.settings import (
     DemoParams,
     ExportParams,
@@ -31,7 +32,6 @@ from scan2sim.services.teleoperation.settings import (
     StationParams,
     VehicleParams,
 )
-from scan2sim.services.teleoperation.station.drivers import DriverRole
 from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 
@@ -150,7 +150,7 @@ def teleop_drivers(
     revoke: Annotated[str, typer.Option(metavar="NAME", help="Remove a driver, who loses control at once.")] = "",
 ) -> None:
     """List, add and remove the named drivers of a station."""
-    from scan2sim.services.teleoperation.station import drivers
+    from scan2sim.services.teleoperation.access import drivers
 
     if revoke:
         drivers.revoke(file, revoke)

@@ -114,6 +114,11 @@ def application(
     return app
 
 
+def add_error(app: FastAPI, kind: type[ScanError], status: int) -> None:
+    """Answer a kind of error with another status than that of `EXIT_CODES`."""
+    app.add_exception_handler(kind, partial(_scan_error_response, status=status))
+
+
 def run(app: FastAPI, params: ServerParams, listening: Callable[[str], None]) -> None:
     """Serve until Ctrl-C; `listening` is called with the URL when the socket is open.
 
@@ -326,9 +331,9 @@ def _error_response(path: str, status: int, cause: str, remedy: str, where: str 
     return JSONResponse(message, status)
 
 
-def _scan_error_response(request: Request, error: Exception) -> Response:
+def _scan_error_response(request: Request, error: Exception, status: int | None = None) -> Response:
     assert isinstance(error, ScanError)
-    return _error_response(request.url.path, http_status(error), error.cause, error.remedy, str(error.where))
+    return _error_response(request.url.path, status or http_status(error), error.cause, error.remedy, str(error.where))
 
 
 def _http_error_response(request: Request, error: Exception) -> Response:

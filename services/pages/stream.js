@@ -3,6 +3,9 @@
 
 class NoToken extends Error {}
 
+// Why the service didn't accept a request's token.
+const tokenFault = () => (sessionStorage.getItem("token") ? "the token is wrong or no longer valid" : "a token is required");
+
 async function request(path, signal) {
   const token = sessionStorage.getItem("token");
   const answer = await fetch(path, { signal, headers: token ? { Authorization: `Bearer ${token}` } : {} });

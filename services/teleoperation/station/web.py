@@ -31,6 +31,7 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from scan2sim.pipeline.core.errors import ScanError, SettingError
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
+from scan2sim.services.teleoperation.access.drivers import Driver, DriverRole, Drivers
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
@@ -39,7 +40,6 @@ from scan2sim.services.teleoperation.identity import Identity, Role
 from scan2sim.services.teleoperation.settings import GATEWAY_PORT, STATION_PORT, StationParams, parse_address
 from scan2sim.services.teleoperation.station import app_window, road_map
 from scan2sim.services.teleoperation.station.app import Station, send_request
-from scan2sim.services.teleoperation.station.drivers import Driver, DriverRole, Drivers
 from scan2sim.services.teleoperation.station.recorder import Recorder
 from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
@@ -164,11 +164,10 @@ class _Page:
         """Check that its driver has a role.
 
         Raises:
-            SettingError: the driver has not.
+            AccessError: the driver has not.
         """
-        if self.driver is not None and not self.driver.role.includes(role):
-            cause = f"has the role {self.driver.role}; this requires {role}"
-            raise SettingError(self.driver.name, cause, "Ask whoever manages the station's drivers (`teleop drivers`)")
+        if self.driver is not None:
+            self.driver.require(role)
 
     async def next(self) -> Frame:
         """Wait for the next frame."""
@@ -225,22 +224,22 @@ def application(
         ]
         if drivers is not None:
             tasks.append(asyncio.create_task(_until_revoked(driver, drivers)))
-        why = "the page was closed"
+        why, revoked = "the page was closed", False
         try:
             station.request_key_frames()
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            if drivers is not None and tasks[-1].done():
+            if revoked := drivers is not None and tasks[-1].done():
                 why = "the driver's access was revoked"
-                station.driver_session.release(page.name, why)
-                await web.close(1008)
         finally:
+            station.driver_session.release(page.name, why)
             for task in tasks:
                 task.cancel()
             for ended in await asyncio.gather(*tasks, return_exceptions=True):
                 if isinstance(ended, Exception) and not isinstance(ended, WebSocketDisconnect):
                     log.error("%s: %r", page.name, ended, exc_info=ended)
             hub.remove(page)
-            station.driver_session.release(page.name, why)
+        if revoked:
+            await web.close(1008)
 
     return app
 

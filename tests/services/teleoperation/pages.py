@@ -13,7 +13,7 @@ from typing import Any
 
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
-from scan2sim.services.teleoperation.station.drivers import Drivers
+from scan2sim.services.teleoperation.access.drivers import Drivers
 from scan2sim.services.teleoperation.station.road_map import MapLine
 from scan2sim.services.teleoperation.station.web import PageHub, application
 from tests.fakes.ports import free_port

@@ -1,4 +1,4 @@
-"""Named drivers of a station: their credentials and roles, in a file that is read again whenever it changes.
+"""Named drivers of a station or gateway: credentials and roles, in a file that is read again whenever it changes.
 
 Each driver has a token, of which the file holds the SHA-256 only. A driver who is removed from the file loses control
 at once; if the file can't be read, so does everybody.
@@ -20,6 +20,11 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, V
 
 from scan2sim.pipeline.core.errors import InputError, SettingError, from_os_error
 from scan2sim.services.teleoperation.gateway_protocol import NAME_PATTERN
+
+
+class AccessError(SettingError):
+    """A driver whose role doesn't include the one that an action requires."""
+
 
 TOKEN_BYTES = 32
 """Random bytes of a driver's token."""
@@ -58,6 +63,16 @@ class Driver(BaseModel):
     def is_valid(self) -> bool:
         """Whether its token has not expired."""
         return self.expires is None or datetime.now(UTC) < self.expires
+
+    def require(self, role: DriverRole) -> None:
+        """Check the driver's role.
+
+        Raises:
+            AccessError: it doesn't include this one.
+        """
+        if not self.role.includes(role):
+            cause = f"has the role {self.role}; this requires {role}"
+            raise AccessError(self.name, cause, "Ask whoever manages the drivers (`teleop drivers`)")
 
 
 _FILE = TypeAdapter(tuple[Driver, ...])
