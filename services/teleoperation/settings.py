@@ -60,6 +60,14 @@ class PageParams(ServerParams):
         ),
     ] = None
 
+    oidc: Annotated[
+        File | None,
+        Field(
+            description="TOML file of an OpenID provider at which drivers sign in, if --drivers has their logins "
+            "(docs/teleoperation.md)."
+        ),
+    ] = None
+
     def has_protection(self) -> bool:
         """Whether a token, a certificate, or named drivers are given."""
         return self.drivers is not None or super().has_protection()

@@ -14,7 +14,8 @@ from fastapi.responses import FileResponse
 
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
-from scan2sim.services.teleoperation.access.drivers import AccessError, Driver, DriverRole, Drivers
+from scan2sim.services.teleoperation.access.drivers import Access, AccessError, Driver, DriverRole
+from scan2sim.services.teleoperation.access.sign_in import access, protected
 from scan2sim.services.teleoperation.gateway.fleet import Fleet
 from scan2sim.services.teleoperation.gateway.server import Gateway
 from scan2sim.services.teleoperation.identity import Identity, Role
@@ -26,7 +27,7 @@ AUDIT_AUTHOR = "fleet management"
 Station = Annotated[str, Body(embed=True, min_length=1, max_length=60)]
 
 
-def application(served: ServerParams, fleet: Fleet, gateway: Gateway, drivers: Drivers | None = None) -> FastAPI:
+def application(served: ServerParams, fleet: Fleet, gateway: Gateway, drivers: Access | None = None) -> FastAPI:
     """The fleet page and its API.
 
     Args:
@@ -39,9 +40,7 @@ def application(served: ServerParams, fleet: Fleet, gateway: Gateway, drivers: D
     Raises:
         InputError: the token can't be read.
     """
-    accepts = None if drivers is None else lambda token: drivers.identify(token) is not None
-    app = factory.application("Fleet", served, alive={"gateway": gateway.alive}, public=("/",), accepts=accepts)
-    factory.add_error(app, AccessError, 403)
+    app = protected("Fleet", served, {"gateway": gateway.alive}, drivers)
 
     def viewer(request: Request) -> Driver | None:
         return None if drivers is None else drivers.identify(factory.sent_token(request.scope) or "")
@@ -111,7 +110,7 @@ def serve(params: GatewayParams, notify: Callable[[str], None]) -> None:
     Raises:
         ScanError: the certificate or stored state can't be read, or the gateway can't listen.
     """
-    drivers = None if params.drivers is None else Drivers(params.drivers)
+    drivers = access(params)
     identity = Identity.read(params.certificates, Role.GATEWAY)
     fleet = Fleet(params.state)
     trail = fleet.audit.verification
