@@ -27,6 +27,8 @@ from scan2sim.pipeline.core.errors import (
 
 PAGES = Path(__file__).parents[1] / "docs"
 """Folder of the pages that help and errors name as docs/NAME.md; part of the wheel."""
+KEEPING_STEPS = ("run", "export", "import", "segment", "slam", "survey")
+"""Commands whose finished steps are kept when they are interrupted."""
 COMMANDS = {
     "run": (
         "run",
@@ -143,6 +145,11 @@ def _run_survey_with_prefect(*arguments: Any) -> None:
         raise IncompleteError(report.parent / "world", state.message or "")
 
 
+def _keeps_steps(arguments: list[str]) -> bool:
+    """Whether an interrupted command has results that the same command continues from."""
+    return next(iter(arguments), "") in KEEPING_STEPS
+
+
 def main() -> None:
     """Run the command; each error becomes a message and an exit code (`pipeline.core.errors.EXIT_CODES`)."""
     os.environ.setdefault(
@@ -162,7 +169,7 @@ def main() -> None:
             typer.echo("\n".join([*lines[:-1], f"{lines[-1]} ({time.perf_counter() - began:.1f} s)"]))
     except SystemExit as ended:
         if ended.code == exit_code(KeyboardInterrupt()):  # typer's exit code for Ctrl-C
-            typer.echo(INTERRUPTED, err=True)
+            typer.echo(INTERRUPTED if _keeps_steps(sys.argv[1:]) else "Interrupted.", err=True)
         raise
     except Exception as error:
         if isinstance(error, OSError):

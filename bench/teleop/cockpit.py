@@ -15,7 +15,7 @@ import tempfile
 import threading
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -84,7 +84,14 @@ class Desk:
         station, vehicle: their processes; relay: the network between them; page: the driver page.
     """
 
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        stack: ExitStack,
+        cameras: Sequence[str] = ("front=pattern:",),
+        size: tuple[int, int] = (320, 240),
+    ) -> None:
+        """Start all of it; `cameras`: as option `--camera`; `size`: of their frames, pixels."""
         self.car, parties, ended = Car(), folder / "parties", threading.Event()
         certify(parties, [HERE], ["car"], ["desk"])
         key = parties / "vehicle-car" / ADAPTER_KEY_FILE
@@ -108,7 +115,7 @@ class Desk:
         self.vehicle = self._run(
             "vehicle", parties / "vehicle-car", f"{HERE}:{gateway}", "--adapter", f"{HERE}:{adapter.address[1]}",
             *(word for host in HOSTS for word in ("--link", f"{host}={host}")),
-            "--camera", "front=pattern:", "--size", 320, 240, "--limit", LIMIT_MS,
+            *(word for camera in cameras for word in ("--camera", camera)), "--size", *size, "--limit", LIMIT_MS,
         )  # fmt: skip
         until(self._join)
         self.page = stack.enter_context(chromium(folder))

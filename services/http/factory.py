@@ -17,7 +17,9 @@ import contextlib
 import hmac
 import logging
 import re
-from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+import signal
+import threading
+from collections.abc import Awaitable, Callable, Iterator, Mapping, MutableMapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -123,7 +125,7 @@ def add_error(app: FastAPI, kind: type[ScanError], status: int) -> None:
 
 
 def run(app: FastAPI, params: ServerParams, listening: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C; `listening` is called with the URL when the socket is open.
+    """Serve until Ctrl-C or SIGTERM; `listening` is called with the URL when the socket is open.
 
     Raises:
         SettingError: it can't listen on the address or port.
@@ -147,8 +149,25 @@ def run(app: FastAPI, params: ServerParams, listening: Callable[[str], None]) ->
             loop=f"{LimitedEventLoop.__module__}:{LimitedEventLoop.__name__}",
             timeout_graceful_shutdown=1,  # event streams of live pages never end by themselves
         )
-        with end_process_with_threads():
+        with _until_signal(), end_process_with_threads():
             uvicorn.Server(config).run(sockets=[listener])
+
+
+@contextlib.contextmanager
+def _until_signal() -> Iterator[None]:
+    """Return on Ctrl-C and SIGTERM, which end a service normally: callers close what they have opened.
+
+    uvicorn raises both signals again when it has stopped.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _add_health(app: FastAPI, alive: Mapping[str, Check], ready: Mapping[str, Check]) -> None:
