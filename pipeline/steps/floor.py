@@ -133,4 +133,4 @@ def _joined(meshes: list[Mesh], terrain: PointCloud) -> Mesh:
     )
 
 
-FLOOR = Step("floor", 4, floor, FloorParams, memory=(0.6, 30))
+FLOOR = Step("floor", 5, floor, FloorParams, memory=(0.6, 30))

@@ -66,6 +66,8 @@ def complete(
     gap: float,
     openings: Bools | None = None,
     stairs: Bools | None = None,
+    *,
+    within_walls: bool = False,
 ) -> Storey:
     """The floor of a storey: scanned heights (rows, columns), and a membrane where the floor is assumed.
 
@@ -78,6 +80,7 @@ def complete(
         gap: gaps narrower than twice this are closed, metres.
         openings: cells that stay open, or None.
         stairs: cells that do not determine the assumed heights around them, or None.
+        within_walls: whether an assumed floor ends at walls: behind them it was neither scanned nor walked on.
     """
     from scipy import ndimage
 
@@ -91,14 +94,19 @@ def complete(
     around = nearest_heights(base)
     above = standing[:, 2] - around[raster.at(standing)] if len(standing) else np.zeros(0)
     obstacles = standing[(above > -LIMITS.step) & (above < LIMITS.obstacle)]
-    covered = measured | (raster.covered(obstacles) if len(obstacles) else False)
-    if path is not None and len(path):
-        covered |= dilate(raster.covered(path), LIMITS.path_radius / cell)
+    on_path = dilate(raster.covered(path), LIMITS.path_radius / cell) if path is not None and len(path) else False
+    covered = measured | on_path | (raster.covered(obstacles) if len(obstacles) else False)
     wanted = ndimage.binary_fill_holes(close_gaps(covered, gap / cell))
+    wall = np.zeros(raster.shape, bool)
+    if within_walls and len(standing):
+        high = (above > LIMITS.wall_height) & (above < LIMITS.obstacle)
+        wall = close_gaps(raster.covered(standing[high]), 1.5) if high.any() else wall
+        wanted = _without_outside(wanted, wall, measured | on_path)
     part, count = ndimage.label(wanted, np.ones((3, 3)))
     area = np.bincount(part[np.isfinite(known) & wanted], minlength=count + 1)
     area[0] = 0
-    wanted = dilate((area >= 0.02 * area.max())[part] & wanted, 1.5)
+    wanted &= (area >= 0.02 * area.max())[part]
+    wanted |= dilate(wanted & ~wall, 1.5)
     if openings is not None:
         wanted &= ~openings | measured
     base = np.where(wanted, base, np.nan)
@@ -108,6 +116,22 @@ def complete(
     height[rest] = around[rest]
     near = ndimage.distance_transform_edt(~measured) * cell <= LIMITS.scanned_radius if measured.any() else measured
     return Storey(np.where(wanted, height, np.nan), near & wanted)
+
+
+def _without_outside(wanted: Bools, wall: Bools, known: Bools) -> Bools:
+    """Cells of a floor without the parts behind its walls: those without a known cell, and open where walls end."""
+    from scipy import ndimage
+
+    part, count = ndimage.label(wanted & ~wall)
+    inside = ndimage.binary_erosion(part > 0)
+    edge, open_edge = (
+        np.bincount(part[mask], minlength=count + 1)
+        for mask in (~inside & (part > 0), ndimage.binary_dilation(~wanted) & (part > 0))
+    )
+    outside = open_edge > LIMITS.outside_open_share * edge
+    outside[np.bincount(part.ravel())[1:].argmax() + 1 if count else 0] = False
+    outside[part[known]] = False
+    return wanted & ~outside[part]
 
 
 def nearest_heights(height: F64) -> F64:

@@ -17,6 +17,7 @@ class FloorLimits:
     max_cells: int = 4_000_000  # cells become larger beyond that
     cluster_gap: float = 0.3  # heights of a column that are further apart are different surfaces
     wall_extent: float = 0.35  # higher clusters of a column contain the foot of a wall
+    outside_open_share: float = 0.25  # share of a part's edge that is no wall, from which it is behind the walls
     step: float = 0.3  # height difference up to which neighbouring heights are one surface: stairs, kerbs
     neighbour_radius: float = 0.5  # horizontal distance up to which heights are neighbours
     slope: float = 0.3  # of ground between separate parts

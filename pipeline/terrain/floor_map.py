@@ -86,7 +86,7 @@ def floor_map(
         feet, sensor_height = filtered_floor(raster, nodes, foot, path)
         gap = gap if level else max(gap, LIMITS.filtered_gap)
         standing = np.concatenate([ground, others])  # the feet of walls pass for ground if nothing is below them
-        storey = complete(raster, np.full(raster.shape, np.nan), feet, standing, path, gap)
+        storey = complete(raster, np.full(raster.shape, np.nan), feet, standing, path, gap, within_walls=level)
         return FloorMap(raster, (storey,), True, sensor_height)
     levels = _storey_levels(raster, nodes)
     storeys: list[Storey] = []
@@ -111,7 +111,8 @@ def floor_map(
         standing = others[(others[:, 2] < top) & (others[:, 2] > start)]
         closed = _openings(raster, storeys[-1], scanned, low, np.concatenate([ground, others])) if storeys else None
         climbs = scanned > low + LIMITS.headroom / 2 if k + 1 < len(levels) else None
-        storeys.append(complete(raster, scanned, feet, standing, path if k == 0 else None, gap, closed, climbs))
+        walked = path if k == 0 else None
+        storeys.append(complete(raster, scanned, feet, standing, walked, gap, closed, climbs, within_walls=level))
     return FloorMap(raster, tuple(storeys), False, sensor_height)
 
 

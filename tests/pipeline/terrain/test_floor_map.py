@@ -65,7 +65,19 @@ def test_hole_in_the_scan_is_filled_and_marked() -> None:
 def test_floor_ends_at_the_walls() -> None:
     far = noisy(level((20, 20), (20.3, 20.3), 1.5))  # seen through a window
     found = find(noisy(level((0, 0), (SIZE, SIZE))), np.concatenate([noisy(walls()), far]))
-    assert found.area < (SIZE + 0.6) ** 2
+    assert found.area < (SIZE + 0.3) ** 2
+
+
+@pytest.mark.parametrize("scanned", [True, False])
+def test_no_floor_is_assumed_behind_the_walls(scanned: bool) -> None:
+    """The gap between two rooms with a common corner, outside of both, is narrow enough to be closed."""
+    rooms = [walls(size=3.0), walls(size=3.0) + [3.0, 3.0, 0.0]]
+    ground = np.concatenate([level((0, 0), (3, 3)), level((3, 3), (6, 6))]) if scanned else np.zeros((0, 3))
+    found = find(noisy(ground), noisy(np.concatenate(rooms)))
+    indoors = np.concatenate([inside(margin=0.2, size=3.0), inside(margin=0.2, size=3.0) + 3.0])
+    assert np.isfinite(heights(found, indoors)).all()
+    behind = np.column_stack([RNG.uniform(3.25, 6, 500), RNG.uniform(0, 2.75, 500)])
+    assert np.isnan(heights(found, np.concatenate([behind, behind[:, ::-1]]))).all()
 
 
 def test_map_without_ground_gets_a_floor_at_the_bottom_of_its_walls() -> None:
