@@ -63,6 +63,7 @@ def main() -> int:
     # where it is set, as in many containers, each of about a thousand processes would compile all modules again
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as in the processes of steps: workers share the cores
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads always wait actively
     parser = argparse.ArgumentParser(prog="python -m tests.suite", description=__doc__, add_help=False)
     parser.add_argument("-m", dest="markers", default="not slow")
     parser.add_argument("--report", type=Path)

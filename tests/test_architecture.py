@@ -178,6 +178,11 @@ def test_pipeline_definition_imports_no_heavy_package() -> None:
     assert loaded_by("import scan2sim.flows.pipelines.tile") <= {"numpy"}
 
 
+@pytest.mark.parametrize("command", ["run", "plan", "view", "export", "inspect", "verify"])
+def test_command_for_worlds_starts_without_the_packages_of_steps(command: str) -> None:
+    assert loaded_by(f"import scan2sim.flows.commands.{command}") <= {"numpy"}
+
+
 def test_every_setting_is_documented() -> None:
     from scan2sim.flows.pipelines.steps import STEPS
 

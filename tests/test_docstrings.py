@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -30,15 +31,50 @@ BUILT = {
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
+@dataclass(frozen=True)
+class Module:
+    """What the tests need of a module: its syntax tree would fill the memory, and slow down collecting garbage.
+
+    Attributes:
+        docstrings: of the module, of classes, functions and constants, with their lines.
+        documented: functions and classes with a docstring.
+        words: names and words outside of the docstrings.
+    """
+
+    docstrings: list[tuple[int, str]]
+    documented: list[Documented]
+    words: set[str]
+
+
+@dataclass(frozen=True)
+class Documented:
+    """Function or class with a docstring."""
+
+    line: int
+    name: str
+    docstring: str
+    arguments: set[str]
+
+
 @cache
-def parsed(file: Path) -> ast.Module:
-    """Syntax tree of a module."""
-    return ast.parse(file.read_text(encoding="utf-8"))
+def module(file: Path) -> Module:
+    """What the tests need of a module."""
+    nodes = list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+    strings = docstrings(nodes)
+    definitions = [node for node in nodes if isinstance(node, Function | ast.ClassDef)]
+    return Module(
+        [(node.lineno, str(node.value)) for node in strings],
+        [
+            Documented(node.lineno, node.name, text, arguments(node))
+            for node in definitions if (text := ast.get_docstring(node))
+        ],
+        {file.stem, file.parent.name, *words(nodes, {id(node) for node in strings})},
+    )  # fmt: skip
 
 
-def docstrings(tree: ast.Module) -> list[ast.Constant]:
+def docstrings(nodes: list[ast.AST]) -> list[ast.Constant]:
     """Strings that are statements: docstrings of modules, classes and functions, descriptions of constants."""
-    statements = (node for node in ast.walk(tree) if isinstance(node, ast.Expr))
+    statements = (node for node in nodes if isinstance(node, ast.Expr))
     return [
         node.value for node in statements if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
     ]
@@ -65,12 +101,9 @@ def arguments(node: Function | ast.ClassDef) -> set[str]:
     return {one.arg for one in (*args.posonlyargs, *args.args, *args.kwonlyargs, args.vararg, args.kwarg) if one}
 
 
-def words(file: Path) -> Iterator[str]:
-    """Names and words of a module outside of its docstrings."""
-    yield from (file.stem, file.parent.name)
-    tree = parsed(file)
-    skipped = set(docstrings(tree))
-    for node in ast.walk(tree):
+def words(nodes: list[ast.AST], skipped: set[int]) -> Iterator[str]:
+    """Names and words of nodes, without those whose id is skipped."""
+    for node in nodes:
         match node:
             case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name) | ast.keyword(arg=str(name)):
                 yield name
@@ -78,7 +111,7 @@ def words(file: Path) -> Iterator[str]:
                 yield name
             case ast.alias(name=name):
                 yield from name.split(".")
-            case ast.Constant(value=str(text)) if node not in skipped:
+            case ast.Constant(value=str(text)) if id(node) not in skipped:
                 yield from re.findall(r"\w+", text)
 
 
@@ -88,21 +121,20 @@ def test_described_arguments_exist(package: str) -> None:
     for file in MODULES:
         if file.relative_to(ROOT).parts[0] != package:
             continue
-        for node in ast.walk(parsed(file)):
-            if isinstance(node, Function | ast.ClassDef) and (text := ast.get_docstring(node)):
-                unknown = set(described(text)) - arguments(node)
-                wrong += [f"{file.relative_to(ROOT)}:{node.lineno} {node.name}: {unknown}"] if unknown else []
+        for one in module(file).documented:
+            unknown = set(described(one.docstring)) - one.arguments
+            wrong += [f"{file.relative_to(ROOT)}:{one.line} {one.name}: {unknown}"] if unknown else []
     assert not wrong, "docstrings describe arguments that don't exist:\n" + "\n".join(wrong)
 
 
 def test_names_in_backticks_exist() -> None:
     known = FOREIGN | BUILT
-    known.update(word for file in MODULES for word in words(file))
+    known.update(*(module(file).words for file in MODULES))
     known.update(*(re.findall(r"\w+", page.read_text(encoding="utf-8")) for page in ROOT.glob("services/pages/*.js")))
     unknown = [
-        f"{file.relative_to(ROOT)}:{text.lineno} `{name}`"
-        for file in MODULES for text in docstrings(parsed(file))
-        for name in re.findall(r"(?<!`)`([A-Za-z_]\w*)`(?!`)", str(text.value)) if name not in known
+        f"{file.relative_to(ROOT)}:{line} `{name}`"
+        for file in MODULES for line, text in module(file).docstrings
+        for name in re.findall(r"(?<!`)`([A-Za-z_]\w*)`(?!`)", text) if name not in known
     ]  # fmt: skip
     assert not unknown, "docstrings mention names that don't occur in the code:\n" + "\n".join(unknown)
 

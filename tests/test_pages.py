@@ -51,6 +51,7 @@ IMAGES, ARRAYS, MESHES = {"png", "jpg"}, {"npz", "npy", "laz", "csv"}, {"obj", "
 SUFFIXES = {"py", "js", "json", "md", "geojson", "toml", *IMAGES, *ARRAYS, *MESHES}
 
 
+@cache
 def text_of(page: Path) -> str:
     """Text of a page, or the docstring of a module."""
     text = page.read_text(encoding="utf-8")

@@ -11,9 +11,7 @@ from rich.table import Table
 
 from scan2sim.flows.commands.app import App, Config, Force, From, HoldOut, Sets, settings_of
 from scan2sim.flows.commands.display import console
-from scan2sim.flows.commands.drive import DRIVE, PREPARED, plan_drive
 from scan2sim.flows.commands.robot_map import imported_tile
-from scan2sim.flows.commands.survey import planned_survey
 from scan2sim.flows.engine.estimate import Estimate, duration, estimates, summary, total
 from scan2sim.flows.engine.planning import STORE, PlannedTask, check
 from scan2sim.flows.engine.planning import plan as plan_nodes
@@ -26,7 +24,7 @@ from scan2sim.pipeline.core.types import Tile
 from scan2sim.pipeline.io.tile import read_tile
 
 app = App()
-SURVEY = "survey.toml"
+SURVEY, DRIVE = "survey.toml", "drive.toml"
 SHOWN_CAUSES = 2
 """Causes listed for each tile of a survey."""
 
@@ -65,12 +63,16 @@ def show_plan(path: Path, out: Path, settings: Settings, *, force: bool = False,
     if survey.name == SURVEY and survey.is_file():
         if force or start is not None:
             raise SettingError("--force, --from", "are for single tiles", "Leave them out")
+        from scan2sim.flows.commands.survey import planned_survey  # imports Numba, as `drive` does
+
         planned, store, unread = planned_survey(survey, out, settings)
         check(planned)
         rows = estimates(planned, store)
         _show_tiles(rows, unread)
     else:
         if drive.name == DRIVE and drive.is_file():
+            from scan2sim.flows.commands.drive import PREPARED, plan_drive
+
             planned, store, _ = plan_drive(drive, out / PREPARED)
         else:
             planned, store = plan_tile(read_tile(imported_tile(path, out)), out, settings, force, start)

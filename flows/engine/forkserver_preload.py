@@ -1,9 +1,12 @@
 """What nearly every step needs, imported once by the server from which task processes are forked.
 
 Steps and Numba's type tables are included: the demo's 59 processes take 52 s with them, 55 s with the libraries alone
-(`python -m bench.profile`).
+(`python -m bench.profile`). Garbage collections in the task processes skip them: they would copy the memory that all
+processes share.
 """
 
+import atexit
+import gc
 from importlib import import_module
 
 import scan2sim.flows.engine.thread_limit  # isort: skip  # before the libraries
@@ -28,3 +31,7 @@ import_module("open3d")
 
 cpu_target.typing_context.refresh()
 cpu_target.target_context.refresh()
+
+gc.collect()
+gc.freeze()
+atexit.register(gc.unfreeze)  # or libraries report leaks

@@ -12,7 +12,6 @@ from functools import cache
 
 from scan2sim import __version__
 from scan2sim.flows.engine.planning import PlannedTask
-from scan2sim.flows.pipelines.steps import STEPS
 from scan2sim.pipeline.core.errors import WorkerError
 
 EXTRAS_WITHOUT_STEPS = ("flows", "ray", "s3", "bus", "broker", "orchestration", "toolboxes", "teleop", "can", "dev")
@@ -43,6 +42,8 @@ def check_version(item: PlannedTask, wanted: Mapping[str, str]) -> None:
     Raises:
         WorkerError: this machine has another version of the project, of the step, or of a package.
     """
+    from scan2sim.flows.pipelines.steps import STEPS  # imports Numba
+
     mine, name = versions(), item.task.step.name
     others = [f"{k} {mine[k]} instead of {v}" for k, v in wanted.items() if mine.get(k, v) != v]
     local = next((step.version for step in STEPS if step.name == name), item.task.step.version)
