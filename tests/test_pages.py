@@ -32,6 +32,7 @@ from scan2sim.pipeline.io.tile import TileFile
 from scan2sim.services.monitoring.events.notify import NotifyParams
 from scan2sim.services.monitoring.events.rules import Rule
 from scan2sim.services.orchestration.deployment import Deployment
+from scan2sim.services.teleoperation.access.oidc import OidcParams
 from tests.conftest import ROOT
 
 PACKAGES = ("pipeline", "segmentation", "texturing", "slam", "flows", "services", "data_samples")
@@ -149,7 +150,7 @@ def rejected(model: type[BaseModel], table: dict[str, Any]) -> list[Any]:
     return []
 
 
-FILE_MODELS = (Drive, TileFile, SurveyFile, RulesFile, Deployment)
+FILE_MODELS = (Drive, TileFile, SurveyFile, RulesFile, Deployment, OidcParams)
 
 
 @pytest.mark.parametrize("page", page_params([page for page in PAGES + MODULES if "```toml" in text_of(page)]))

@@ -131,7 +131,7 @@ Classes = Annotated[
         "(docs/reference/formats.md#classes).",
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 Link = Annotated[bool, typer.Option("--link", help="Link the input files into the tile instead of copying them.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing tile.")]
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from scan2sim.flows.commands.app import App, Json
 from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, warn
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, progress_lines, say
+from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, print_result, progress_lines, say
 from scan2sim.flows.commands.orchestrate_sites import cluster as cluster_commands
 from scan2sim.flows.commands.orchestrate_sites import repo as repo_commands
 from scan2sim.flows.commands.orchestrate_sites import vim as vim_commands
@@ -80,14 +80,15 @@ def orchestrate_package(
             help="Helm repository in OSM that contains the chart; default: the chart is included in the package."
         ),
     ] = None,
+    as_json: Json = False,
 ) -> None:
     """Write the OSM packages of a service: its network function (VNF/KNF) and its network service (NS)."""
     from scan2sim.services.orchestration.package import build
 
     packages = build(description.read(service), environment, "machine" if machine else "container", prefix, repository)
     out.mkdir(parents=True, exist_ok=True)
-    for one in (packages.function, packages.service):
-        say(str(one.save(out)))
+    function, service_file = packages.function.save(out), packages.service.save(out)
+    print_result(as_json, f"{function}\n{service_file}", function=str(function), service=str(service_file))
 
 
 @app.command("list")
@@ -130,24 +131,28 @@ def orchestrate_list(params: Connection, as_json: Json = False) -> None:
 def orchestrate_onboard(
     params: Connection,
     files: Annotated[list[Path], typer.Argument(metavar="PACKAGE...", help="Package files (.tar.gz), in any order.")],
+    as_json: Json = False,
 ) -> None:
     """Upload packages to OSM; those that it has already stay unchanged, and a bad one doesn't stop the others."""
     from scan2sim.services.orchestration import operations, package
 
-    packages, errors = [], list[ScanError]()
+    packages, errors, onboarded = [], list[ScanError](), list[str]()
     for path in files:
         try:
             packages.append(package.read(path))
         except ScanError as error:
             errors.append(error)
-    with osm_client(params) as osm:
+    with messages_on_stderr(as_json), osm_client(params) as osm:
         for outcome in operations.onboard_each(osm, packages):
             if isinstance(outcome, ScanError):
                 errors.append(outcome)
             else:
+                onboarded.append(outcome.partition(" ")[2])
                 say(f"{outcome} is onboarded")
-    for one in errors[:-1]:
-        warn(str(one))
+        for one in errors[:-1]:
+            warn(str(one))
+    if as_json:
+        print_json({"onboarded": onboarded, "failed": [str(one) for one in errors]})
     if errors:
         raise errors[-1]
 
@@ -173,6 +178,7 @@ def orchestrate_instantiate(
     namespace: Annotated[
         str, typer.Option(help="Kubernetes namespace to run it in; default: that of the OSM project.")
     ] = "",
+    as_json: Json = False,
 ) -> None:
     """Create and start an instance of a network service."""
     from scan2sim.services.orchestration import operations
@@ -181,46 +187,49 @@ def orchestrate_instantiate(
     if bool(vim) == bool(cluster):
         raise SettingError("--vim", "exactly one of --vim and --cluster is needed", "Give one of them")
     keys, values = tuple(read_key(path) for path in ssh_key or ()), _values(value or [])
-    with operation(params, name) as (osm, wait_policy, notify):
+    with operation(params, name, as_json) as (osm, wait_policy, notify):
         site = osm.cluster(cluster) if cluster else osm.vim(vim)
         operations.instantiate(
             osm, name, nsd, site, replicas=params.replicas, keys=keys, values=values, namespace=namespace,
             wait_policy=wait_policy, notify=notify,
         )  # fmt: skip
-    say(f"{name} {'runs' if params.wait else 'is being started'}")
+    text = f"{name} {'runs' if params.wait else 'is being started'}"
+    print_result(as_json, text, instance=name, operation="instantiate", finished=params.wait)
 
 
 @app.command("scale")
 @options(ScaleInstanceParams, name="INSTANCE")
-def orchestrate_scale(params: ScaleInstanceParams) -> None:
+def orchestrate_scale(params: ScaleInstanceParams, as_json: Json = False) -> None:
     """Set the number of replicas of an instance's function."""
     from scan2sim.services.orchestration import operations
 
-    with operation(params, params.name) as (osm, wait_policy, notify):
+    with operation(params, params.name, as_json) as (osm, wait_policy, notify):
         operations.scale(osm, params.name, params.replicas, wait_policy, notify)
-    say(f"{params.name}: {params.replicas} replicas")
+    facts = {"instance": params.name, "operation": "scale", "finished": params.wait, "replicas": params.replicas}
+    print_result(as_json, f"{params.name}: {params.replicas} replicas", **facts)
 
 
 @app.command("heal")
 @options(OperationParams)
-def orchestrate_heal(params: OperationParams, name: Instance) -> None:
+def orchestrate_heal(params: OperationParams, name: Instance, as_json: Json = False) -> None:
     """Heal an instance: recreate its virtual machines, apply its charts again."""
     from scan2sim.services.orchestration import operations
 
-    with operation(params, name) as (osm, wait_policy, notify):
+    with operation(params, name, as_json) as (osm, wait_policy, notify):
         operations.heal(osm, name, wait_policy, notify)
-    say(f"{name} {'is healed' if params.wait else 'is being healed'}")
+    text = f"{name} {'is healed' if params.wait else 'is being healed'}"
+    print_result(as_json, text, instance=name, operation="heal", finished=params.wait)
 
 
 @app.command("terminate")
 @options(OperationParams)
-def orchestrate_terminate(params: OperationParams, name: Instance) -> None:
+def orchestrate_terminate(params: OperationParams, name: Instance, as_json: Json = False) -> None:
     """Stop an instance; its record stays in OSM."""
     from scan2sim.services.orchestration import operations
 
-    with operation(params, name) as (osm, wait_policy, notify):
+    with operation(params, name, as_json) as (osm, wait_policy, notify):
         operations.terminate(osm, name, wait_policy, notify)
-    say(f"{name} is terminated")
+    print_result(as_json, f"{name} is terminated", instance=name, operation="terminate", finished=True)
 
 
 @app.command("delete")
@@ -234,6 +243,7 @@ def orchestrate_delete(
             help="A services.toml, to delete all that it lists; package files; or names or ids in OSM.",
         ),
     ],
+    as_json: Json = False,
 ) -> None:
     """Delete all services of a services.toml, or a service by its package files, or instances and packages by name."""
     from scan2sim.services.orchestration import operations, package
@@ -242,11 +252,15 @@ def orchestrate_delete(
     files = [Path(one) for one in what if one.endswith((".gz", ".tgz", ".toml"))]
     if len(files) not in (0, len(what)):
         raise SettingError("WHAT", "mixes files with names in OSM", "Give only files, or only names")
-    if any(path.suffix == ".toml" for path in files):
-        for path in files:
-            _apply(params, path, delete=True)
+    if deployments := [path for path in files if path.suffix == ".toml"]:
+        if len(deployments) != len(files) or (as_json and len(files) > 1):
+            cause = "mixes a services.toml with packages" if len(deployments) != len(files) else "has several results"
+            raise SettingError("WHAT", cause, "Give one services.toml")
+        with messages_on_stderr(as_json):
+            for path in deployments:
+                _apply(params, path, delete=True, as_json=as_json)
         return
-    with osm_client(params) as osm, progress_lines("delete") as report:
+    with messages_on_stderr(as_json), osm_client(params) as osm, progress_lines("delete") as report:
         wait_policy = WaitPolicy(params.timeout)
         if files:
             operations.delete(osm, [package.read(path) for path in files], wait_policy, lambda text: report(0.5, text))
@@ -255,8 +269,7 @@ def orchestrate_delete(
             operations.delete_instance(osm, name, wait_policy, lambda text: report(0.5, text))
         if rest := [name for name in what if not files and name not in instances]:
             operations.delete_packages(osm, rest)
-    for name in what:
-        say(f"{name} is deleted")
+    print_result(as_json, "\n".join(f"{name} is deleted" for name in what), deleted=what)
 
 
 @app.command("plan")

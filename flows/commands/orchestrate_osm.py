@@ -1,4 +1,4 @@
-"""Shared by the commands of `scan2sim orchestrate`: the client of OSM, and progress on a terminal and without one."""
+"""Shared by the commands of `scan2sim orchestrate`: client of OSM, results, progress with and without a terminal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, progress, warn
 from scan2sim.pipeline.core.step import Report
 from scan2sim.services.orchestration.settings import Connection, OperationParams
 
@@ -25,11 +25,14 @@ def osm_client(params: Connection, pacer: Any = None) -> Iterator[Osm]:
 
 
 @contextmanager
-def operation(params: OperationParams, name: str) -> Iterator[tuple[Osm, WaitPolicy, Any]]:
-    """Client of OSM, how long to wait, and the function that shows the progress of a single operation."""
+def operation(params: OperationParams, name: str, as_json: bool) -> Iterator[tuple[Osm, WaitPolicy, Any]]:
+    """Client of OSM, how long to wait, and the function that shows the progress of a single operation.
+
+    With `as_json` progress goes to standard error.
+    """
     from scan2sim.services.orchestration.lifecycle import WaitPolicy
 
-    with osm_client(params) as osm, progress_lines(name) as report:
+    with messages_on_stderr(as_json), osm_client(params) as osm, progress_lines(name) as report:
         yield osm, WaitPolicy(params.timeout, params.wait), lambda text: report(0.5, text)
 
 
@@ -54,3 +57,8 @@ def progress_lines(title: str) -> Iterator[Report]:
 def say(text: str) -> None:
     """Print a line as it is."""
     console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def print_result(as_json: bool, text: str, **facts: Any) -> None:
+    """Print the result of a single operation: as a line, or its facts as JSON."""
+    print_json(facts) if as_json else say(text)

@@ -13,7 +13,7 @@ from rich.table import Table
 from scan2sim.flows.commands.app import App, Json
 from scan2sim.flows.commands.display import console, messages_on_stderr, print_json
 from scan2sim.flows.commands.options import assigned, options
-from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, say
+from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, print_result
 from scan2sim.services.credentials import redacted
 from scan2sim.services.orchestration.settings import Connection, OperationParams
 
@@ -52,6 +52,7 @@ def vim_add(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="One of these settings; not for credentials; repeatable."),
     ] = None,
+    as_json: Json = False,
 ) -> None:
     """Register a VIM account; `--type dummy` for a Kubernetes cluster without a VIM."""
     from scan2sim.services.orchestration import sites
@@ -60,7 +61,7 @@ def vim_add(
         name, url, kind=kind, user=vim_user, password=sites.read_secret(vim_password), tenant=tenant,
         config=sites.vim_config(config, assigned(set_ or (), "insecure=true")),
     )  # fmt: skip
-    _add(params, "vim", lambda _: body)
+    _add(params, "vim", lambda _: body, as_json)
 
 
 @cluster.command("add")
@@ -78,6 +79,7 @@ def cluster_add(
     vim: Annotated[str, typer.Option("--vim", help="Name or id of the cluster's VIM account.")],
     kubernetes: Annotated[str, typer.Option(help="Kubernetes version of the cluster.")] = "1.30",
     network: Annotated[str | None, typer.Option(help="VIM network of the cluster's nodes; default: none.")] = None,
+    as_json: Json = False,
 ) -> None:
     """Register a Kubernetes cluster."""
     from scan2sim.services.orchestration import sites
@@ -85,7 +87,7 @@ def cluster_add(
     def body(osm: Any) -> dict[str, Any]:
         return sites.cluster_request(name, kubeconfig, vim=osm.vim(vim), version=kubernetes, network=network)
 
-    _add(params, "cluster", body)
+    _add(params, "cluster", body, as_json)
 
 
 @repo.command("add")
@@ -100,22 +102,24 @@ def repo_add(
     repo_password: Annotated[
         Path | None, typer.Option(help="File with the password or token at a private repository.")
     ] = None,
+    as_json: Json = False,
 ) -> None:
     """Register a repository of Helm charts."""
     from scan2sim.services.orchestration import sites
 
     password = None if repo_password is None else sites.read_secret(repo_password)
     body = sites.repository_request(name, url, user=repo_user, password=password)
-    _add(params, "repo", lambda _: body)
+    _add(params, "repo", lambda _: body, as_json)
 
 
-def _add(params: OperationParams, which: str, body: Callable[[Any], dict[str, Any]]) -> None:
+def _add(params: OperationParams, which: str, body: Callable[[Any], dict[str, Any]], as_json: bool) -> None:
     from scan2sim.services.orchestration import sites
 
-    with operation(params, which) as (osm, wait_policy, notify):
+    with operation(params, which, as_json) as (osm, wait_policy, notify):
         made = body(osm)
         new = sites.add(osm, sites.COLLECTIONS[which], made, wait_policy, notify)
-    say(f"{made['name']} is {'added' if new else 'already in OSM, and unchanged'}")
+    text = f"{made['name']} is {'added' if new else 'already in OSM, and unchanged'}"
+    print_result(as_json, text, name=made["name"], added=new, finished=params.wait)
 
 
 def _facts(one: SiteRecord) -> dict[str, str]:
@@ -154,13 +158,14 @@ def _declare(group: App, which: str) -> None:
     def remove(
         params: OperationParams,
         name: Annotated[str, typer.Argument(metavar="NAME", help="Name or id in OSM.")],
+        as_json: Json = False,
     ) -> None:
         """Remove from OSM, which refuses it while an instance uses it."""
         from scan2sim.services.orchestration import sites
 
-        with operation(params, name) as (osm, wait_policy, _):
+        with operation(params, name, as_json) as (osm, wait_policy, _):
             sites.remove(osm, sites.COLLECTIONS[which], name, wait_policy)
-        say(f"{name} is removed")
+        print_result(as_json, f"{name} is removed", removed=name)
 
 
 for _group, _which in ((vim, "vim"), (cluster, "cluster"), (repo, "repo")):

@@ -12,7 +12,7 @@ from rich.table import Table
 from scan2sim.flows.commands.app import App, Json
 from scan2sim.flows.commands.display import console, messages_on_stderr, print_json
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, say
+from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, print_result
 from scan2sim.flows.commands.orchestrate_sites import REQUIREMENT
 from scan2sim.services.orchestration.settings import Connection, OperationParams
 
@@ -48,24 +48,25 @@ def _services(template: TemplateRecord) -> list[str]:
 def add_template(
     params: Connection,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Template: a YAML file, or a .tar.gz package.")],
+    as_json: Json = False,
 ) -> None:
     """Onboard a network slice template (NST); its network services must be in OSM."""
     from scan2sim.services.orchestration import slices
 
-    with osm_client(params) as osm:
+    with messages_on_stderr(as_json), osm_client(params) as osm:
         name = slices.add_template(osm, file)
-    say(f"{name} is in OSM")
+    print_result(as_json, f"{name} is in OSM", name=name)
 
 
 @app.command("remove-template")
 @options(Connection)
-def remove_template(params: Connection, name: NameOrId) -> None:
+def remove_template(params: Connection, name: NameOrId, as_json: Json = False) -> None:
     """Remove a template from OSM, which refuses it while a slice uses it."""
     from scan2sim.services.orchestration import slices
 
-    with osm_client(params) as osm:
+    with messages_on_stderr(as_json), osm_client(params) as osm:
         slices.remove_template(osm, name)
-    say(f"{name} is removed")
+    print_result(as_json, f"{name} is removed", removed=name)
 
 
 @app.command("list")
@@ -92,12 +93,13 @@ def create(
     template: Annotated[str, typer.Argument(metavar="TEMPLATE", help="Name or id of its template in OSM.")],
     vim: Annotated[str | None, typer.Option(help="Name or id of the VIM account for its services.")] = None,
     cluster: Annotated[str | None, typer.Option(help="Kubernetes cluster whose VIM account is used instead.")] = None,
+    as_json: Json = False,
 ) -> None:
     """Create a network slice from a template and instantiate its services."""
     from scan2sim.pipeline.core.errors import SettingError
     from scan2sim.services.orchestration import slices
 
-    with operation(params, name) as (osm, wait_policy, notify):
+    with operation(params, name, as_json) as (osm, wait_policy, notify):
         if cluster and not vim:
             site = osm.cluster(cluster)
         elif vim and not cluster:
@@ -106,15 +108,15 @@ def create(
             raise SettingError("--vim", "give either --vim or --cluster", "It sets where services are instantiated")
         new = slices.create(osm, name, template, site, wait_policy, notify)
     state = ("is running" if params.wait else "is being instantiated") if new else "is already in OSM, and unchanged"
-    say(f"{name} {state}")
+    print_result(as_json, f"{name} {state}", name=name, created=new, finished=params.wait)
 
 
 @app.command("remove")
 @options(OperationParams)
-def remove(params: OperationParams, name: NameOrId) -> None:
+def remove(params: OperationParams, name: NameOrId, as_json: Json = False) -> None:
     """Terminate a network slice with its services, and remove it; waits until it is gone."""
     from scan2sim.services.orchestration import slices
 
-    with operation(params, name) as (osm, wait_policy, notify):
+    with operation(params, name, as_json) as (osm, wait_policy, notify):
         slices.remove(osm, name, wait_policy, notify)
-    say(f"{name} is removed")
+    print_result(as_json, f"{name} is removed", removed=name)

@@ -22,6 +22,7 @@ from scan2sim.flows.commands.ros_spin import stop_on_signal
 from scan2sim.pipeline.core import optional_deps
 from scan2sim.pipeline.core.errors import DataError, SettingError
 from scan2sim.pipeline.io.worlds.scene import read_scene
+from scan2sim.services.teleoperation.access.drivers import DriverRole
 from scan2sim.services.teleoperation.settings import (
     DemoParams,
     ExportParams,
@@ -31,7 +32,6 @@ from scan2sim.services.teleoperation.settings import (
     StationParams,
     VehicleParams,
 )
-from scan2sim.services.teleoperation.station.drivers import DriverRole
 from scan2sim.services.teleoperation.vehicle import adapters
 from scan2sim.services.teleoperation.vehicle.adapter import AdapterParams, AdapterServer
 
@@ -146,20 +146,32 @@ def teleop_drivers(
         str, typer.Option(metavar="NAME", help="Add a driver, or give one a new token; the token is printed once.")
     ] = "",
     role: Annotated[DriverRole, typer.Option(help="Role of the added driver.")] = DriverRole.DRIVER,
-    days: Annotated[float | None, typer.Option(help="Days until the token expires. Default: never.")] = None,
+    login: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CLAIM",
+            help="The added driver has no token, but signs in at the OpenID provider of --oidc, as this: an e-mail "
+            "address, or what the setting `claim` of the provider's file says.",
+        ),
+    ] = None,
+    days: Annotated[float | None, typer.Option(help="Days until token or login expires. Default: never.")] = None,
     revoke: Annotated[str, typer.Option(metavar="NAME", help="Remove a driver, who loses control at once.")] = "",
 ) -> None:
     """List, add and remove the named drivers of a station."""
-    from scan2sim.services.teleoperation.station import drivers
+    from scan2sim.services.teleoperation.access import drivers
 
+    if login is not None and not add:
+        raise SettingError("--login", "is for a driver who is added", "Give --add NAME, too")
     if revoke:
         drivers.revoke(file, revoke)
     if add:
         expires = None if days is None else datetime.now(UTC) + timedelta(days=days)
-        _say(f"token of {add}: {drivers.add(file, add, role, expires)}")
-    table = Table("driver", "role", "token expires (UTC)")
+        token = drivers.add(file, add, role, expires, login)
+        _say(f"token of {add}: {token}" if token else f"{add} signs in as {login}")
+    table = Table("driver", "role", "credential", "expires (UTC)")
     for one in drivers.read(file):
-        table.add_row(escape(one.name), one.role, "never" if one.expires is None else f"{one.expires:%Y-%m-%d %H:%M}")
+        expiry = "never" if one.expires is None else f"{one.expires:%Y-%m-%d %H:%M}"
+        table.add_row(escape(one.name), one.role, escape(one.login or "token"), expiry)
     console.print(table)
 
 

@@ -79,6 +79,7 @@ def application(
     health: tuple[str, ...] = (),
     max_body_bytes: int = MAX_BODY_BYTES,
     accepts: Callable[[str], bool] | None = None,
+    sign_in: str = "",
 ) -> FastAPI:
     """Create the application of a service, without the paths of the service itself.
 
@@ -91,6 +92,7 @@ def application(
         health: prefixes of its health paths in addition to `HEALTH_PATHS`.
         max_body_bytes: limit of the size of a request's body.
         accepts: whether a token is valid, for a service whose users have their own, instead of the token of `params`.
+        sign_in: path at which users sign in, which responses with status 401 name; "": none.
 
     Raises:
         InputError: the token can't be read.
@@ -104,6 +106,7 @@ def application(
         public=public,
         health=HEALTH_PATHS + health,
         max_body_bytes=max_body_bytes,
+        sign_in=sign_in,
     )
     app.add_exception_handler(ScanError, _scan_error_response)
     app.add_exception_handler(StarletteHTTPException, _http_error_response)
@@ -112,6 +115,11 @@ def application(
     _add_health(app, alive, ready or {})
     _add_metrics(app, alive)
     return app
+
+
+def add_error(app: FastAPI, kind: type[ScanError], status: int) -> None:
+    """Answer a kind of error with another status than that of `EXIT_CODES`."""
+    app.add_exception_handler(kind, partial(_scan_error_response, status=status))
 
 
 def run(app: FastAPI, params: ServerParams, listening: Callable[[str], None]) -> None:
@@ -183,10 +191,11 @@ class _Guard:
         public: tuple[str, ...],
         health: tuple[str, ...],
         max_body_bytes: int,
+        sign_in: str,
     ) -> None:
         self._app, self._local, self._public, self._health = app, local, public, health
         self._bodies, self._requests = Bodies(max_body_bytes), 0
-        self._accepts = accepts
+        self._accepts, self._sign_in = accepts, sign_in
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
         with request_in_progress():
@@ -213,7 +222,10 @@ class _Guard:
         if self._accepts is not None:
             if (token := sent_token(scope)) is not None and self._accepts(token):
                 return None
-            response = _error_response(path, 401, "requires a token", "Send the header Authorization: Bearer TOKEN")
+            remedy = "Send the header Authorization: Bearer TOKEN"
+            if self._sign_in:
+                remedy = f"Sign in at {self._sign_in}, or send a token: Authorization: Bearer TOKEN"
+            response = _error_response(path, 401, "requires a token", remedy, sign_in=self._sign_in)
             response.headers["WWW-Authenticate"] = "Bearer"
             return response
         host = headers.get(b"host", b"").decode("latin-1")
@@ -317,18 +329,20 @@ def _with_headers(send: Send) -> Send:
     return send_with_headers
 
 
-def _error_response(path: str, status: int, cause: str, remedy: str, where: str = "") -> JSONResponse:
+def _error_response(
+    path: str, status: int, cause: str, remedy: str, where: str = "", sign_in: str = ""
+) -> JSONResponse:
     """Response to a request; without `where`, the error is in its path."""
     where = where or printable(path)
     message = {"error": f"{where}: {cause}. {remedy}"}
     if not path.startswith(INFERENCE_PATHS):
         message = {"where": where, "cause": cause, "remedy": remedy, **message}
-    return JSONResponse(message, status)
+    return JSONResponse(message | ({"sign_in": sign_in} if sign_in else {}), status)
 
 
-def _scan_error_response(request: Request, error: Exception) -> Response:
+def _scan_error_response(request: Request, error: Exception, status: int | None = None) -> Response:
     assert isinstance(error, ScanError)
-    return _error_response(request.url.path, http_status(error), error.cause, error.remedy, str(error.where))
+    return _error_response(request.url.path, status or http_status(error), error.cause, error.remedy, str(error.where))
 
 
 def _http_error_response(request: Request, error: Exception) -> Response:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import ssl
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, ClassVar, Self
 
 from pydantic import Field, model_validator
 
@@ -23,6 +23,9 @@ class ServerParams(Params):
     Raises:
         SettingError: other machines could reach it, and neither a token nor a certificate is given.
     """
+
+    PROTECTION: ClassVar[str] = "--token FILE, or --certificate and --key"
+    """Options of which it requires one if other machines can reach it."""
 
     host: Annotated[
         str,
@@ -42,9 +45,7 @@ class ServerParams(Params):
 
     @model_validator(mode="after")
     def _is_protected(self) -> Self:
-        require_protection(
-            self.host, protected=self.has_protection(), options="--token FILE, or --certificate and --key"
-        )
+        require_protection(self.host, protected=self.has_protection(), options=self.PROTECTION)
         return self
 
     def has_protection(self) -> bool:

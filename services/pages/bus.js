@@ -296,7 +296,7 @@ async function begin() {
 
 function askForToken() {
   byId("token").hidden = false;
-  status("lost", sessionStorage.getItem("token") ? "the token is wrong" : "a token is required");
+  status("lost", tokenFault());
 }
 
 function showLive(seconds) {

@@ -386,7 +386,7 @@ byId("fetch").addEventListener("submit", (event) => {
 });
 byId("token").addEventListener("submit", (event) => {
   event.preventDefault();
-  sessionStorage.setItem("token", event.target.elements.token.value);
+  sessionStorage.setItem("token", event.target.elements.token.value.trim());
   byId("token").hidden = true;
 });
 
@@ -411,7 +411,7 @@ async function connect() {
     await request("/api/station", AbortSignal.timeout(5000));
   } catch (error) {
     byId("token").hidden = !(error instanceof NoToken);
-    throw error instanceof NoToken ? new Error("a token is required") : error;
+    throw error instanceof NoToken ? new Error(tokenFault()) : error;
   }
   loadMap();
   const token = sessionStorage.getItem("token"),

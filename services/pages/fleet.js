@@ -55,7 +55,7 @@ function card(one, pairText) {
 // Who has control, and since when; a station of an earlier version doesn't report it.
 const driver = (one) => (one.driver ? ` by ${one.driver} since ${time(one.driver_since)}` : "");
 
-function vehicle(one, stations) {
+function vehicle(one, stations, mayChange) {
   const [made, line] = card(one, one.other ? `driven from ${one.other}${driver(one)}` : "no station");
   const choice = element("span", undefined, "choice"),
     speed = element("output"),
@@ -64,6 +64,9 @@ function vehicle(one, stations) {
   select.ariaLabel = `station for ${one.name}`;
   select.append(...free.map((station) => element("option", station.name)));
   const selected = () => ({ station: select.value });
+  speed.dataset.vehicle = one.name;
+  line.append(speed);
+  if (!mayChange) return made;
   if (free.length && one.connected) choice.append(select);
   if (one.pair === null) choice.append(button("Join", !free.length || !one.connected, () => act(one.name, "join", selected())));
   else {
@@ -71,8 +74,7 @@ function vehicle(one, stations) {
     if (one.before) choice.append(button(`Back to ${one.before}`, false, () => act(one.name, "take-back")));
     choice.append(button("Release", false, () => act(one.name, "release")));
   }
-  speed.dataset.vehicle = one.name;
-  line.append(speed, choice);
+  line.append(choice);
   return made;
 }
 
@@ -109,7 +111,9 @@ async function refresh() {
     const audit = await (await request("/api/audit", AbortSignal.timeout(5000))).json();
     const text = JSON.stringify([fleet, audit]);
     if (text !== shown && document.activeElement?.tagName !== "SELECT") {
-      byId("vehicles").replaceChildren(...fleet.vehicles.map((one) => vehicle(one, fleet.stations)));
+      const mayChange = !fleet.you || fleet.you.role === "operator";
+      byId("you").textContent = fleet.you ? `${fleet.you.name}, ${fleet.you.role}` : "";
+      byId("vehicles").replaceChildren(...fleet.vehicles.map((one) => vehicle(one, fleet.stations, mayChange)));
       byId("stations").replaceChildren(...fleet.stations.map(station));
       byId("audit").replaceChildren(...audit.map(auditRow));
       byId("none").hidden = fleet.vehicles.length > 0;
@@ -119,15 +123,20 @@ async function refresh() {
     status.textContent = "live";
     status.dataset.state = "live";
   } catch (error) {
-    byId("token").hidden = !(error instanceof NoToken);
-    status.textContent = error instanceof NoToken ? "a token is required" : error.message;
+    const rejected = error instanceof NoToken;
+    byId("token").hidden = !rejected;
+    if (rejected) {
+      for (const part of ["you", "vehicles", "stations", "audit"]) byId(part).replaceChildren();
+      shown = "";
+    }
+    status.textContent = rejected ? tokenFault() : error.message;
     status.dataset.state = "lost";
   }
 }
 
 byId("token").addEventListener("submit", (event) => {
   event.preventDefault();
-  sessionStorage.setItem("token", event.target.elements.token.value);
+  sessionStorage.setItem("token", event.target.elements.token.value.trim());
   refresh();
 });
 

@@ -71,14 +71,14 @@ async function refresh() {
     status.dataset.state = "live";
   } catch (error) {
     byId("token").hidden = !(error instanceof NoToken);
-    status.textContent = error instanceof NoToken ? "a token is required" : error.message;
+    status.textContent = error instanceof NoToken ? tokenFault() : error.message;
     status.dataset.state = "lost";
   }
 }
 
 byId("token").addEventListener("submit", (event) => {
   event.preventDefault();
-  sessionStorage.setItem("token", event.target.elements.token.value);
+  sessionStorage.setItem("token", event.target.elements.token.value.trim());
   refresh();
 });
 

@@ -3,10 +3,30 @@
 
 class NoToken extends Error {}
 
+// Takes over the session with which a sign-in ends; a fragment of an address is sent to no server.
+if (location.hash.startsWith("#session=")) {
+  sessionStorage.setItem("token", decodeURIComponent(location.hash.slice("#session=".length)));
+  history.replaceState(null, "", location.pathname);
+}
+
+// Shows the link of the sign-in beside the form of the token, if there is a sign-in.
+async function offerSignIn(answer) {
+  const { sign_in: path } = await answer.json().catch(() => ({}));
+  const link = byId("sign-in");
+  if (link) link.hidden = !path;
+  if (link && path) link.href = path;
+}
+
+// Why the service didn't accept a request's token.
+const tokenFault = () => (sessionStorage.getItem("token") ? "the token is wrong or no longer valid" : "a token is required");
+
 async function request(path, signal) {
   const token = sessionStorage.getItem("token");
   const answer = await fetch(path, { signal, headers: token ? { Authorization: `Bearer ${token}` } : {} });
-  if (answer.status === 401) throw new NoToken();
+  if (answer.status === 401) {
+    await offerSignIn(answer);
+    throw new NoToken();
+  }
   if (!answer.ok) throw await errorOf(answer);
   return answer;
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -47,8 +47,38 @@ def parse_address(option: str, text: str, default_port: int) -> Address:
     return Address(host=found[1] or found[2], port=number)
 
 
-class GatewayParams(ServerParams):
-    """Settings of the gateway; `ServerParams` has those of its web page."""
+class PageParams(ServerParams):
+    """Settings of a page for named drivers; `ServerParams` has those of every page."""
+
+    PROTECTION: ClassVar[str] = f"--drivers FILE, {ServerParams.PROTECTION}"
+
+    drivers: Annotated[
+        File | None,
+        Field(
+            description="File of named drivers with their roles and tokens, written by `teleop drivers`; replaces "
+            "--token. Default: anybody who has the page can do everything."
+        ),
+    ] = None
+
+    oidc: Annotated[
+        File | None,
+        Field(
+            description="TOML file of an OpenID provider at which drivers sign in, if --drivers has their logins "
+            "(docs/teleoperation.md)."
+        ),
+    ] = None
+
+    def has_protection(self) -> bool:
+        """Whether a token, a certificate, or named drivers are given."""
+        return self.drivers is not None or super().has_protection()
+
+    def is_open(self) -> bool:
+        """See `ServerParams`."""
+        return self.drivers is None and super().is_open()
+
+
+class GatewayParams(PageParams):
+    """Settings of the gateway; `PageParams` has those of its web page."""
 
     certificates: CertificateFolder
     listening: Annotated[
@@ -68,8 +98,8 @@ MapWorld = Annotated[
 ]
 
 
-class StationParams(ServerParams):
-    """Settings of a station; `ServerParams` has those of its web page."""
+class StationParams(PageParams):
+    """Settings of a station; `PageParams` has those of its web page."""
 
     certificates: CertificateFolder
     gateway: GatewayAddress
@@ -77,13 +107,6 @@ class StationParams(ServerParams):
         tuple[str, ...],
         Field(description="HOST:PORT (UDP) on which the station accepts vehicles; repeat for several addresses."),
     ] = (f"0.0.0.0:{STATION_PORT}",)
-    drivers: Annotated[
-        File | None,
-        Field(
-            description="File of named drivers with their roles and tokens, written by `teleop drivers`; replaces "
-            "--token. Default: anybody who has the page drives."
-        ),
-    ] = None
     world: MapWorld = None
     record: Annotated[
         File | None,
@@ -99,14 +122,6 @@ class StationParams(ServerParams):
             "router that forwards a port. Default: the listening address."
         ),
     ] = ()
-
-    def has_protection(self) -> bool:
-        """Whether a token, a certificate, or named drivers are given."""
-        return self.drivers is not None or super().has_protection()
-
-    def is_open(self) -> bool:
-        """See `ServerParams`."""
-        return self.drivers is None and super().is_open()
 
 
 class ReplayParams(ServerParams):

@@ -31,6 +31,8 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from scan2sim.pipeline.core.errors import ScanError, SettingError
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
+from scan2sim.services.teleoperation.access.drivers import Access, Driver, DriverRole
+from scan2sim.services.teleoperation.access.sign_in import access, protected
 from scan2sim.services.teleoperation.control.controls import Controls, Gear
 from scan2sim.services.teleoperation.control.messages import Command
 from scan2sim.services.teleoperation.gateway.client import GatewayConnection
@@ -39,7 +41,6 @@ from scan2sim.services.teleoperation.identity import Identity, Role
 from scan2sim.services.teleoperation.settings import GATEWAY_PORT, STATION_PORT, StationParams, parse_address
 from scan2sim.services.teleoperation.station import app_window, road_map
 from scan2sim.services.teleoperation.station.app import Station, send_request
-from scan2sim.services.teleoperation.station.drivers import Driver, DriverRole, Drivers
 from scan2sim.services.teleoperation.station.recorder import Recorder
 from scan2sim.services.teleoperation.transport.station_side import Listener
 from scan2sim.services.teleoperation.video.jitter_buffer import Frame
@@ -164,11 +165,10 @@ class _Page:
         """Check that its driver has a role.
 
         Raises:
-            SettingError: the driver has not.
+            AccessError: the driver has not.
         """
-        if self.driver is not None and not self.driver.role.includes(role):
-            cause = f"has the role {self.driver.role}; this requires {role}"
-            raise SettingError(self.driver.name, cause, "Ask whoever manages the station's drivers (`teleop drivers`)")
+        if self.driver is not None:
+            self.driver.require(role)
 
     async def next(self) -> Frame:
         """Wait for the next frame."""
@@ -183,7 +183,7 @@ def application(
     station: Station,
     hub: PageHub,
     request_pair: Callable[[str, str, str], bool],
-    drivers: Drivers | None = None,
+    drivers: Access | None = None,
     map_lines: Sequence[road_map.MapLine] = (),
 ) -> FastAPI:
     """The driver page and its API.
@@ -199,8 +199,7 @@ def application(
     Raises:
         InputError: the token can't be read.
     """
-    accepts = None if drivers is None else lambda token: drivers.identify(token) is not None
-    app = factory.application("Teleoperation", served, alive={"station": station.alive}, public=("/",), accepts=accepts)
+    app = protected("Teleoperation", served, {"station": station.alive}, drivers)
     road_map.add_route(app, map_lines)
 
     @app.get("/", include_in_schema=False)
@@ -214,7 +213,8 @@ def application(
 
     @app.websocket("/live")
     async def live(web: WebSocket) -> None:
-        driver = None if drivers is None else drivers.identify(factory.sent_token(web.scope) or "")
+        token = factory.sent_token(web.scope) or ""
+        driver = None if drivers is None else drivers.identify(token)
         await web.accept(subprotocol=factory.chosen_protocol(web.scope))
         page = _Page(driver)
         hub.add(page)
@@ -224,30 +224,30 @@ def application(
             asyncio.create_task(_receive(web, page, station, request_pair)),
         ]
         if drivers is not None:
-            tasks.append(asyncio.create_task(_until_revoked(driver, drivers)))
-        why = "the page was closed"
+            tasks.append(asyncio.create_task(_until_revoked(driver, token, drivers)))
+        why, revoked = "the page was closed", False
         try:
             station.request_key_frames()
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            if drivers is not None and tasks[-1].done():
+            if revoked := drivers is not None and tasks[-1].done():
                 why = "the driver's access was revoked"
-                station.driver_session.release(page.name, why)
-                await web.close(1008)
         finally:
+            station.driver_session.release(page.name, why)
             for task in tasks:
                 task.cancel()
             for ended in await asyncio.gather(*tasks, return_exceptions=True):
                 if isinstance(ended, Exception) and not isinstance(ended, WebSocketDisconnect):
                     log.error("%s: %r", page.name, ended, exc_info=ended)
             hub.remove(page)
-            station.driver_session.release(page.name, why)
+        if revoked:
+            await web.close(1008)
 
     return app
 
 
-async def _until_revoked(driver: Driver | None, drivers: Drivers) -> None:
-    """Return when a driver is no longer valid."""
-    while driver is not None and drivers.is_current(driver):
+async def _until_revoked(driver: Driver | None, token: str, drivers: Access) -> None:
+    """Return when a token isn't that of its driver, with the same role, any more."""
+    while driver is not None and drivers.identify(token) == driver:
         await asyncio.sleep(REVOCATION_PERIOD_S)
 
 
@@ -319,7 +319,7 @@ def serve(params: StationParams, notify: Callable[[str], None], window: bool = F
     """
     if window:
         app_window.browser()
-    drivers = None if params.drivers is None else Drivers(params.drivers)
+    drivers = access(params)
     map_lines = () if params.world is None else road_map.read(params.world)
     if params.world is not None and not map_lines:
         notify(f"{params.world} has no roads: the driver page shows no map")

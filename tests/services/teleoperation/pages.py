@@ -13,7 +13,7 @@ from typing import Any
 
 from scan2sim.services.http import factory
 from scan2sim.services.http.settings import ServerParams
-from scan2sim.services.teleoperation.station.drivers import Drivers
+from scan2sim.services.teleoperation.access.drivers import Access
 from scan2sim.services.teleoperation.station.road_map import MapLine
 from scan2sim.services.teleoperation.station.web import PageHub, application
 from tests.fakes.ports import free_port
@@ -38,7 +38,7 @@ class Cockpit:
 
 @contextmanager
 def served(
-    tmp_path: Path, params: ServerParams, drivers: Drivers | None = None, map_lines: Sequence[MapLine] = ()
+    tmp_path: Path, params: ServerParams, drivers: Access | None = None, map_lines: Sequence[MapLine] = ()
 ) -> Iterator[Cockpit]:
     """Serve the page of a street's station."""
     street = Street(tmp_path)
@@ -54,7 +54,7 @@ def served(
 
 
 def page_of(
-    street: Street, params: ServerParams, drivers: Drivers | None = None, map_lines: Sequence[MapLine] = ()
+    street: Street, params: ServerParams, drivers: Access | None = None, map_lines: Sequence[MapLine] = ()
 ) -> Cockpit:
     desk = street.desk()
     hub = PageHub(lambda frame: joined.age(frame.captured) if (joined := desk.station.joined()) else 0.0)
