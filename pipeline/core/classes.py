@@ -20,7 +20,9 @@ from scan2sim.pipeline.core.types import I64, U8, Bools
 
 Group = Literal["terrain", "building", "vegetation", "vehicle", "ceiling", "furniture"]
 GROUPS: tuple[Group, ...] = ("terrain", "building", "vegetation")
-INDOOR_GROUPS: tuple[Group, ...] = ("ceiling", "furniture")
+CEILING: Group = "ceiling"
+"""Surface that hides rooms from above: views from there omit it (`flows/reports/pages/walk.js` by this name, too)."""
+INDOOR_GROUPS: tuple[Group, ...] = (CEILING, "furniture")
 """Further surfaces of an indoor map; in other clouds their classes have no surface."""
 SURFACES: tuple[Group, ...] = (*GROUPS, "vehicle", *INDOOR_GROUPS)
 """All surfaces of a world: the groups, parked vehicles if `split.vehicles` keeps them, and those of indoor maps."""
