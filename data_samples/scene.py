@@ -185,18 +185,17 @@ class Scene:
         mesh = Mesh(FRAME, part.vertices, part.faces, classification=part.classification)
         return mesh.keep(np.arange(len(part.faces)) < self.static)
 
-    def car_at(self, time: npt.ArrayLike, centre: Any = 0.0, way: Any = 1.0) -> tuple[F64, F64, Bools]:
+    def car_at(self, time: npt.ArrayLike, way: Any) -> tuple[F64, F64, Bools]:
         """Pose of the moving car `time` seconds after it passes the middle of the street.
 
         Args:
             time: (...) seconds.
-            centre: offset of the chainage, metres.
             way: direction of travel along the axis, 1 or -1.
 
         Returns:
             Position (..., 3), heading (...), and whether it is within the street (never if the style has none).
         """
-        s = self.layout.axis.length / 2 + np.asarray(time, np.float64) * CAR_SPEED_M_S * way + centre
+        s = self.layout.axis.length / 2 + np.asarray(time, np.float64) * CAR_SPEED_M_S * way
         t = -np.asarray(way) * self.layout.lane / 2
         xy, heading = self.layout.axis.place(s, t)
         z = self.layout.height(s, t) + 0.01
