@@ -12,9 +12,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from scan2sim.flows.commands.app import App, Json
-from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, warn
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, print_line, warn
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, progress_lines, say
+from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, progress_lines
 from scan2sim.flows.commands.orchestrate_sites import cluster as cluster_commands
 from scan2sim.flows.commands.orchestrate_sites import repo as repo_commands
 from scan2sim.flows.commands.orchestrate_sites import vim as vim_commands
@@ -87,7 +87,7 @@ def orchestrate_package(
     packages = build(description.read(service), environment, "machine" if machine else "container", prefix, repository)
     out.mkdir(parents=True, exist_ok=True)
     for one in (packages.function, packages.service):
-        say(str(one.save(out)))
+        print_line(str(one.save(out)))
 
 
 @app.command("list")
@@ -145,7 +145,7 @@ def orchestrate_onboard(
             if isinstance(outcome, ScanError):
                 errors.append(outcome)
             else:
-                say(f"{outcome} is onboarded")
+                print_line(f"{outcome} is onboarded")
     for one in errors[:-1]:
         warn(str(one))
     if errors:
@@ -187,7 +187,7 @@ def orchestrate_instantiate(
             osm, name, nsd, site, replicas=params.replicas, keys=keys, values=values, namespace=namespace,
             wait_policy=wait_policy, notify=notify,
         )  # fmt: skip
-    say(f"{name} {'runs' if params.wait else 'is being started'}")
+    print_line(f"{name} {'runs' if params.wait else 'is being started'}")
 
 
 @app.command("scale")
@@ -198,7 +198,7 @@ def orchestrate_scale(params: ScaleInstanceParams) -> None:
 
     with operation(params, params.name) as (osm, wait_policy, notify):
         operations.scale(osm, params.name, params.replicas, wait_policy, notify)
-    say(f"{params.name}: {params.replicas} replicas")
+    print_line(f"{params.name}: {params.replicas} replicas")
 
 
 @app.command("heal")
@@ -209,7 +209,7 @@ def orchestrate_heal(params: OperationParams, name: Instance) -> None:
 
     with operation(params, name) as (osm, wait_policy, notify):
         operations.heal(osm, name, wait_policy, notify)
-    say(f"{name} {'is healed' if params.wait else 'is being healed'}")
+    print_line(f"{name} {'is healed' if params.wait else 'is being healed'}")
 
 
 @app.command("terminate")
@@ -220,7 +220,7 @@ def orchestrate_terminate(params: OperationParams, name: Instance) -> None:
 
     with operation(params, name) as (osm, wait_policy, notify):
         operations.terminate(osm, name, wait_policy, notify)
-    say(f"{name} is terminated")
+    print_line(f"{name} is terminated")
 
 
 @app.command("delete")
@@ -256,7 +256,7 @@ def orchestrate_delete(
         if rest := [name for name in what if not files and name not in instances]:
             operations.delete_packages(osm, rest)
     for name in what:
-        say(f"{name} is deleted")
+        print_line(f"{name} is deleted")
 
 
 @app.command("plan")
@@ -271,7 +271,7 @@ def orchestrate_plan(params: Connection, services: Services, as_json: Json = Fal
     if as_json:
         print_json([asdict(one) for one in changes])
         return
-    console.print(_changes(changes)) if changes else say("nothing to do: all services are as described")
+    console.print(_changes(changes)) if changes else print_line("nothing to do: all services are as described")
 
 
 @app.command("apply")
@@ -305,7 +305,7 @@ def orchestrate_place(
         table.add_row(one.environment, "[green]fits" if one.fits else "[red]no", why)
     console.print(table)
     nearest = next((one for one in placements if one.fits), None)
-    say(f"nearest to the robot: {nearest.environment}" if nearest else "no site meets the requirements")
+    print_line(f"nearest to the robot: {nearest.environment}" if nearest else "no site meets the requirements")
 
 
 @app.command("page")
@@ -315,7 +315,7 @@ def orchestrate_page(params: PageParams) -> None:
     optional_deps.require("the page", "fastapi", "uvicorn", "prometheus_client")
     from scan2sim.services.orchestration.page import serve
 
-    serve(params, say)
+    serve(params, print_line)
 
 
 @app.command("pool")
@@ -362,7 +362,7 @@ def _print_result(result: ApplyResult, as_json: bool) -> None:
         print_json({"done": [asdict(one) for one in result.done], "failed": failed})
         return
     if not result.done and not result.failed:
-        say("nothing to do: all services are as described")
+        print_line("nothing to do: all services are as described")
         return
     table = Table("name", "", "")
     for change in result.done:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.commands.display import console, print_line, progress, warn
 from scan2sim.pipeline.core.step import Report
 from scan2sim.services.orchestration.settings import Connection, OperationParams
 
@@ -46,11 +46,6 @@ def progress_lines(title: str) -> Iterator[Report]:
         if message and message not in last:
             last.clear()
             last.add(message)
-            say(f"{title}: {message}")
+            print_line(f"{title}: {message}")
 
     yield report_line
-
-
-def say(text: str) -> None:
-    """Print a line as it is."""
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -11,9 +11,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from scan2sim.flows.commands.app import App, Json
-from scan2sim.flows.commands.display import console, messages_on_stderr, print_json
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, print_line
 from scan2sim.flows.commands.options import assigned, options
-from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, say
+from scan2sim.flows.commands.orchestrate_osm import operation, osm_client
 from scan2sim.services.credentials import redacted
 from scan2sim.services.orchestration.settings import Connection, OperationParams
 
@@ -115,7 +115,7 @@ def _add(params: OperationParams, which: str, body: Callable[[Any], dict[str, An
     with operation(params, which) as (osm, wait_policy, notify):
         made = body(osm)
         new = sites.add(osm, sites.COLLECTIONS[which], made, wait_policy, notify)
-    say(f"{made['name']} is {'added' if new else 'already in OSM, and unchanged'}")
+    print_line(f"{made['name']} is {'added' if new else 'already in OSM, and unchanged'}")
 
 
 def _facts(one: SiteRecord) -> dict[str, str]:
@@ -160,7 +160,7 @@ def _declare(group: App, which: str) -> None:
 
         with operation(params, name) as (osm, wait_policy, _):
             sites.remove(osm, sites.COLLECTIONS[which], name, wait_policy)
-        say(f"{name} is removed")
+        print_line(f"{name} is removed")
 
 
 for _group, _which in ((vim, "vim"), (cluster, "cluster"), (repo, "repo")):

@@ -10,9 +10,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from scan2sim.flows.commands.app import App, Json
-from scan2sim.flows.commands.display import console, messages_on_stderr, print_json
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, print_line
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, say
+from scan2sim.flows.commands.orchestrate_osm import operation, osm_client
 from scan2sim.flows.commands.orchestrate_sites import REQUIREMENT
 from scan2sim.services.orchestration.settings import Connection, OperationParams
 
@@ -54,7 +54,7 @@ def add_template(
 
     with osm_client(params) as osm:
         name = slices.add_template(osm, file)
-    say(f"{name} is in OSM")
+    print_line(f"{name} is in OSM")
 
 
 @app.command("remove-template")
@@ -65,7 +65,7 @@ def remove_template(params: Connection, name: NameOrId) -> None:
 
     with osm_client(params) as osm:
         slices.remove_template(osm, name)
-    say(f"{name} is removed")
+    print_line(f"{name} is removed")
 
 
 @app.command("list")
@@ -106,7 +106,7 @@ def create(
             raise SettingError("--vim", "give either --vim or --cluster", "It sets where services are instantiated")
         new = slices.create(osm, name, template, site, wait_policy, notify)
     state = ("is running" if params.wait else "is being instantiated") if new else "is already in OSM, and unchanged"
-    say(f"{name} {state}")
+    print_line(f"{name} {state}")
 
 
 @app.command("remove")
@@ -117,4 +117,4 @@ def remove(params: OperationParams, name: NameOrId) -> None:
 
     with operation(params, name) as (osm, wait_policy, notify):
         slices.remove(osm, name, wait_policy, notify)
-    say(f"{name} is removed")
+    print_line(f"{name} is removed")
