@@ -39,11 +39,11 @@ def row(rays: Simulated) -> Row:
         "rays": len(hit),
         "median_m": _percentile(np.abs(error), 50),
         "p90_m": _percentile(np.abs(error), 90),
-        "early_20cm": _share(error < -EARLY_M),
-        "early_50cm": _share(error < -FAR_EARLY_M),
-        "late_50cm": _share(error > FAR_EARLY_M),
-        "missing": _share(~hit),
-        "near_surface": _share(rays.apart < SURFACE_RADIUS_M),
+        "early_20cm": share(error < -EARLY_M),
+        "early_50cm": share(error < -FAR_EARLY_M),
+        "late_50cm": share(error > FAR_EARLY_M),
+        "missing": share(~hit),
+        "near_surface": share(rays.apart < SURFACE_RADIUS_M),
     }
 
 
@@ -87,5 +87,6 @@ def _percentile(values: npt.NDArray[np.floating], percent: float) -> float | Non
     return round(float(np.percentile(values, percent)), 4) if len(values) else None
 
 
-def _share(chosen: Bools) -> float | None:
+def share(chosen: Bools) -> float | None:
+    """Share of True; None of no values."""
     return round(float(chosen.mean()), 4) if len(chosen) else None
