@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -75,12 +75,6 @@ def by_distance(rays: Simulated) -> dict[str, Row]:
 def distance_band(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.integer]:
     """(N,) index in `BAND_NAMES` of ranges (N,) in metres; farther ones are `len(BAND_NAMES)`."""
     return np.digitize(ranges, BANDS_M) - 1
-
-
-def solid(rows: Mapping[str, Row], key: str) -> float | None:
-    """A share (`key`) over all rays that hit surfaces other than vegetation: ground, walls, furniture; None: no ray."""
-    parts = [(one[key], one["rays"]) for name, one in rows.items() if name != "vegetation" and one[key] is not None]
-    return sum(value * rays for value, rays in parts) / sum(rays for _, rays in parts) if parts else None
 
 
 def _percentile(values: npt.NDArray[np.floating], percent: float) -> float | None:
