@@ -110,11 +110,11 @@ def _front(plan: House, rng: np.random.Generator, trim: Paint) -> tuple[list[Ope
     x = plan.width - 0.16 if door_column < columns / 2 else 0.16
     parts.append(tube([(x, -0.09, -0.4), (x, -0.09, height - 0.2)], [0.05, 0.05], pipe, sides=8))
     if plan.storeys > 2 and rng.random() < 0.6:
-        parts += _balconies(plan, upper, columns, rng, trim)
+        parts += _balconies(upper, columns, rng, trim)
     return [*upper, *ground, door], parts
 
 
-def _balconies(plan: House, upper: list[Opening], columns: int, rng: np.random.Generator, trim: Paint) -> list[Part]:
+def _balconies(upper: list[Opening], columns: int, rng: np.random.Generator, trim: Paint) -> list[Part]:
     iron = Paint(Material.PLAIN, DARK_STEEL_RGB, paints.BUILDING)
     column = int(rng.integers(columns))
     parts = []

@@ -17,7 +17,7 @@ from scan2sim.data_samples import rays as tracing
 from scan2sim.data_samples import shader, signs, sky
 from scan2sim.data_samples.ground import CELL_M, KERB_HEIGHT_M
 from scan2sim.data_samples.hills import heights, relative_waves
-from scan2sim.data_samples.scene import srgb
+from scan2sim.data_samples.scene import caster, srgb, tensor
 from scan2sim.data_samples.shapes import Part
 from scan2sim.data_samples.town import Town
 from scan2sim.data_samples.traffic import Traffic
@@ -135,7 +135,7 @@ class Panorama:
         turns = np.ascontiguousarray(rows[:, :3, :3], np.float32)
         moving, boxes = self.traffic.near(time, self._centre) if self.traffic else (None, np.zeros((0, 6), np.float32))
         moving = None if moving is None else self.town.lifted(moving, self._centre)
-        caster = None if moving is None else _scene(moving)
+        nearby = None if moving is None else caster(moving)
         other = self._static if moving is None else _arrays(moving)
         g = self.town.ground
         hills = relative_waves(g.hills, self._centre)
@@ -149,14 +149,14 @@ class Panorama:
             rays = tracing.rays(turns, origins, self.width, self.height, index, right, down, self.lens)
             distance, face, uv = _cast(self._caster, rays)
             moved = np.zeros(len(rays), bool)
-            if caster is not None:
+            if nearby is not None:
                 at = np.flatnonzero(near_vehicle[index])
-                near, near_face, near_uv = _cast(caster, rays[at])
+                near, near_face, near_uv = _cast(nearby, rays[at])
                 closer = near < distance[at]
                 at = at[closer]
                 distance[at], face[at], uv[at], moved[at] = near[closer], near_face[closer], near_uv[closer], True
             kind, normal, shadow = tracing.hit_ground(rays, distance, face, uv, moved, self._static, other, ground, sun)
-            dark = self._caster.test_occlusions(_tensor(shadow)).numpy()
+            dark = self._caster.test_occlusions(tensor(shadow)).numpy()
             rgb = shader.shade(
                 rays, distance, face, uv, moved, kind, normal, dark, self._static, other, ground, boxes, sun, self._sky,
                 self._centre, self._sign_images, np.pi / self.height, gain, SRGB_TABLE, self.town.seed % 1000,
@@ -171,7 +171,7 @@ class Panorama:
         ray = np.concatenate(
             [np.broadcast_to(pose[:3, 3] - [*self._centre, 0], jitter.shape), self.town.sun + jitter], 1
         )
-        visible = 1 - self._caster.test_occlusions(_tensor(ray.astype(np.float32))).numpy().mean()
+        visible = 1 - self._caster.test_occlusions(tensor(ray.astype(np.float32))).numpy().mean()
         to = self.town.sun @ pose[:3, :3]
         lon = ((np.arange(self.width) + 0.5) / self.width - 0.5) * 2 * np.pi
         lat = ((np.arange(self.height) + 0.5) / self.height - 0.5) * np.pi
@@ -188,7 +188,7 @@ class Panorama:
             return
         self._centre = np.round(centre)
         part = self.town.near(self._centre, self.radius)
-        self._static, self._caster = _arrays(part), _scene(part)
+        self._static, self._caster = _arrays(part), caster(part)
 
 
 def linear_light(image: U8) -> F32:
@@ -282,21 +282,7 @@ def _arrays(part: Part) -> tuple[Any, ...]:
     return (part.faces, part.normals, part.uv, part.sky[:, None], part.material, part.colour, part.seed, part.size)
 
 
-def _tensor(array: Any) -> Any:
-    import open3d as o3d
-
-    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
-
-
-def _scene(part: Part) -> Any:
-    import open3d as o3d
-
-    scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(_tensor(part.vertices), _tensor(part.faces.astype(np.uint32)))
-    return scene
-
-
 def _cast(scene: Any, rays: F32) -> tuple[F32, Any, F32]:
     """Distance (N,), face (N,) uint32 and barycentric uv (N, 2) of the first hits of rays (N, 6)."""
-    answer = scene.cast_rays(_tensor(rays))
+    answer = scene.cast_rays(tensor(rays))
     return answer["t_hit"].numpy(), answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()

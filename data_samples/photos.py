@@ -92,14 +92,14 @@ def plan_shots(layout: Layout, drive: Drive, photos: int, exposure_ev: float) ->
         s = (i // each + 0.5) * length / stations
         camera = CAMERA_ORDER[i % 4]
         time = drive.time_at(s)
-        pose = _pose(layout, drive, float(time), camera, rng)
+        pose = _pose(drive, float(time), camera, rng)
         shots.append(
             Shot(f"{i:04d}_{camera}", camera, pose, float(time), float(rng.uniform(-exposure_ev, exposure_ev)))
         )
     return shots
 
 
-def _pose(layout: Layout, drive: Drive, time: float, camera: str, rng: np.random.Generator) -> F64:
+def _pose(drive: Drive, time: float, camera: str, rng: np.random.Generator) -> F64:
     """(4, 4) pose, camera to local coordinates, with small random rotations of the vehicle."""
     (ahead, left, up), yaw, pitch = MOUNTS[camera]
     ground, heading = drive.ground(np.array([time]))

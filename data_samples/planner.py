@@ -69,7 +69,7 @@ class Planner:
         point = self.ground.line[index]
         return point[:2] + offset * np.array([-point[3], point[2]]), float(np.arctan2(point[3], point[2]))
 
-    def _claim(self, corners: F64, clear: float, *, mark: bool = True) -> bool:
+    def _claim(self, corners: F64, clear: float) -> bool:
         """Whether a convex plot (K, 2) is free and at least `clear` from all centre lines; marks it as taken if so."""
         import cv2
 
@@ -86,8 +86,7 @@ class Planner:
         here = self.taken[y0:y1, x0:x1]
         if (here & plot).any():
             return False
-        if mark:
-            here |= plot
+        here |= plot
         return True
 
     def _row(self, a: int, b: int, side: int) -> None:

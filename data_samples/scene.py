@@ -185,18 +185,17 @@ class Scene:
         mesh = Mesh(FRAME, part.vertices, part.faces, classification=part.classification)
         return mesh.keep(np.arange(len(part.faces)) < self.static)
 
-    def car_at(self, time: npt.ArrayLike, centre: Any = 0.0, way: Any = 1.0) -> tuple[F64, F64, Bools]:
+    def car_at(self, time: npt.ArrayLike, way: Any) -> tuple[F64, F64, Bools]:
         """Pose of the moving car `time` seconds after it passes the middle of the street.
 
         Args:
             time: (...) seconds.
-            centre: offset of the chainage, metres.
             way: direction of travel along the axis, 1 or -1.
 
         Returns:
             Position (..., 3), heading (...), and whether it is within the street (never if the style has none).
         """
-        s = self.layout.axis.length / 2 + np.asarray(time, np.float64) * CAR_SPEED_M_S * way + centre
+        s = self.layout.axis.length / 2 + np.asarray(time, np.float64) * CAR_SPEED_M_S * way
         t = -np.asarray(way) * self.layout.lane / 2
         xy, heading = self.layout.axis.place(s, t)
         z = self.layout.height(s, t) + 0.01
@@ -342,11 +341,12 @@ def caster(part: Part | Mesh) -> Any:
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(_tensor(part.vertices), _tensor(part.faces.astype(np.uint32)))
+    scene.add_triangles(tensor(part.vertices), tensor(part.faces.astype(np.uint32)))
     return scene
 
 
-def _tensor(array: npt.NDArray[Any]) -> Any:
+def tensor(array: npt.NDArray[Any]) -> Any:
+    """Open3D tensor of an array."""
     import open3d as o3d
 
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))
@@ -354,7 +354,7 @@ def _tensor(array: npt.NDArray[Any]) -> Any:
 
 def cast_rays(caster: Any, rays: F32) -> Hits:
     """First hits of rays (N, 6), origins and unit directions."""
-    answer = caster.cast_rays(_tensor(rays))
+    answer = caster.cast_rays(tensor(rays))
     distance = answer["t_hit"].numpy().copy()
     face = np.where(np.isfinite(distance), answer["primitive_ids"].numpy().astype(np.int64), -1).astype(np.int32)
     return Hits(distance, face, answer["primitive_uvs"].numpy().copy(), np.zeros(len(rays), np.float32))
@@ -364,7 +364,7 @@ def occluded(caster: Any, rays: F32, far: float = float("inf")) -> Bools:
     """(N,) whether rays (N, 6) hit anything within `far` metres."""
     if len(rays) == 0:
         return np.zeros(0, bool)
-    return caster.test_occlusions(_tensor(rays), 0.0, far).numpy().copy()
+    return caster.test_occlusions(tensor(rays), 0.0, far).numpy().copy()
 
 
 def reflected_light(albedo: F32, normal: F32, sky: F32, facing: F32, sun_strength: float, sky_strength: float) -> F32:

@@ -124,7 +124,7 @@ def random_camera(rng: np.random.Generator) -> Camera:
     return Camera("pinhole", 512, 384, f, f, 255.5, 191.5)
 
 
-def random_pose(rng: np.random.Generator, scene: Scene, drive: Drive, camera: Camera) -> tuple[F64, float]:
+def random_pose(rng: np.random.Generator, scene: Scene, drive: Drive) -> tuple[F64, float]:
     """Random pose (4, 4) on or beside the vehicle's path, preferably looking along the road, and its GPS time."""
     length = scene.layout.axis.length
     s = float(rng.uniform(2, length - 2))
@@ -171,9 +171,9 @@ def street(out: Path, seed: int, images: int) -> int:
             continue
         rng = np.random.default_rng([seed, 78, i])
         camera = random_camera(rng)
-        pose, time = random_pose(rng, scene, drive, camera)
+        pose, time = random_pose(rng, scene, drive)
         while _blocked(scene, camera, pose):
-            pose, time = random_pose(rng, scene, drive, camera)
+            pose, time = random_pose(rng, scene, drive)
         seen = with_fog(render(scene, drive, camera, pose, time), rng)
         ev = float(rng.uniform(-0.8, 0.8))
         image = develop(

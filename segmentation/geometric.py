@@ -67,15 +67,11 @@ class Scale:
 
     Attributes:
         voxel: voxel size above ground.
-        cell: raster of the ground.
-        tolerance: minimum distance of ground points from the ground surface, where that is level.
         min_points: number of points from which a component has a shape.
         variation: surface variation that noise adds on a plane.
     """
 
     voxel: float = 0.2
-    cell: float = GROUND_CELL_M
-    tolerance: float = GROUND_TOLERANCE_M
     min_points: int = MIN_POINTS
     variation: float = 0.0
 
@@ -162,7 +158,7 @@ def _split_sparse(xyz: F32, voxel: float, spacing: float) -> tuple[F32, Bools, S
     # NEIGHBOURS points, one per voxel, of a plane fill a disk; its variance along both axes is a quarter of r^2
     spread = NEIGHBOURS * size**2 / np.pi / 4
     few = max(SPARSE_MIN_POINTS, round(MIN_POINTS * (0.2 / size) ** 2)) if size > voxel else MIN_POINTS
-    return height, ground, Scale(size, cell, tolerance, few, noise**2 / (noise**2 + 2 * spread))
+    return height, ground, Scale(size, few, noise**2 / (noise**2 + 2 * spread))
 
 
 def _grid_noise(xyz: F32) -> float:

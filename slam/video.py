@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
@@ -148,13 +147,9 @@ def _start(written: str | None) -> float | None:
         return None
 
 
-def _natural(path: Path) -> list[Any]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
-
-
 def _files(path: Path) -> list[Path]:
     found = (p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and not file_checks.hidden(p))
-    return sorted(found, key=_natural)
+    return sorted(found, key=lambda path: file_checks.natural_order(path.name))
 
 
 def _folder(path: Path, fps: float, times: Path | None) -> Video:

@@ -39,7 +39,7 @@ PROTOCOLS: dict[ModuleType, tuple[type, ...]] = {
     matchers: (matchers.Backend,),
     trackers: (trackers.Backend,),
     solvers: (solvers.Solver,),
-    clouds: (clouds.Format,),
+    clouds: (clouds.Format, clouds.CloudFormat),
     photogrammetry: (photogrammetry.Program,),
     gps: (gps.Format,),
     decoders: (decoders.Decoder,),

@@ -25,7 +25,7 @@ from scan2sim.pipeline.importers.kitti_raw import Drive, point_times, read_drive
 from scan2sim.pipeline.importers.scanner_path import ScannerPath
 from scan2sim.pipeline.lidar import range_errors
 from scan2sim.pipeline.lidar.casting import Scanner, Simulated
-from scan2sim.pipeline.lidar.range_errors import MAX_RANGE_M, solid
+from scan2sim.pipeline.lidar.range_errors import MAX_RANGE_M, Row
 from scan2sim.pipeline.lidar.score import score
 from scan2sim.pipeline.lidar.sweeps import Sweeps, every_nth, moving_returns, near_moving
 from scan2sim.pipeline.lidar.unreturned import near_excluded, unreturned_rays
@@ -200,7 +200,7 @@ def result(streets: list[Found]) -> dict[str, float | None]:
 
     return {
         "lidar_ground_cm": worst([centimetres(_worst_median(s["by_surface"])) for s in streets]),
-        "lidar_early_share": worst([solid(s["by_surface"], "early_20cm") for s in streets]),
+        "lidar_early_share": worst([_solid(s["by_surface"], "early_20cm") for s in streets]),
         "lidar_vegetation_early_share": worst([s["by_surface"]["vegetation"]["early_50cm"] for s in streets]),
         "lidar_phantom_share": worst([s["phantoms"]["phantom"] for s in streets]),
         "lidar_f22": worst([s["range_image"]["f_score"] for s in streets], -1),
@@ -297,3 +297,9 @@ def _in_tracked(xyz: F32, tracked: list[boxes.Box]) -> Bools:
         own = (np.abs(local[:, :2]) < box.size[:2] / 2 + BOX_MARGIN_M).all(axis=1)
         inside |= own & (np.abs(local[:, 2] - box.size[2] / 2) < box.size[2] / 2 + BOX_MARGIN_M)
     return inside
+
+
+def _solid(rows: Mapping[str, Row], key: str) -> float | None:
+    """A share (`key`) over all rays that hit surfaces other than vegetation: ground, walls, furniture; None: no ray."""
+    parts = [(one[key], one["rays"]) for name, one in rows.items() if name != "vegetation" and one[key] is not None]
+    return sum(value * rays for value, rays in parts) / sum(rays for _, rays in parts) if parts else None

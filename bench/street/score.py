@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import pairwise
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools
+from scan2sim.texturing.evaluate import psnr
 
 TRUTH = Path(__file__).with_name("truth.json")
 
@@ -81,11 +81,6 @@ def apply_gain(rgb: U8, gain: F64) -> F64:
 def squared_error(photo: U8, like: npt.NDArray[Any], counts: Bools) -> float:
     """Mean squared error over all channels where `counts`."""
     return float(((like[counts].astype(np.float64) - photo[counts]) ** 2).mean())
-
-
-def psnr(mse: float) -> float:
-    """PSNR in dB from the mean squared error of 8-bit values."""
-    return 10 * math.log10(255**2 / max(mse, 1e-3))
 
 
 def _grey(image: npt.NDArray[Any]) -> F64:

@@ -37,7 +37,6 @@ from scan2sim.services.toolboxes import yolo
 from scan2sim.services.toolboxes.detector.dataset import MIN_VISIBLE_SHARE, read, read_image
 from scan2sim.services.toolboxes.detector.evaluate import (
     MIN_HEIGHT_PX,
-    PEOPLE,
     VEHICLES,
     curve,
     vehicle_predictions,
@@ -47,6 +46,7 @@ from scan2sim.services.toolboxes.tasks import Model
 from scan2sim.services.toolboxes.tasks import detect as task
 
 OWN_WEIGHTS = ROOT / "services" / "toolboxes" / "weights" / "vehicles.onnx"
+PEOPLE = ("person", "cyclist")
 SEED, IMAGES, MIN_SIDE_PX = 500, 240, 12.0
 RAW_0009 = "kitti_raw0009_f00-24"
 WITHOUT_PEOPLE = (RAW_0009, "kitti_raw0013_f62-83", "kitti_odo04_f00-24")

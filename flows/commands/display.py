@@ -82,6 +82,11 @@ def warn(text: str) -> None:
     console.print(f"[yellow]warning:[/] {escape(printable(text))}", highlight=False, soft_wrap=True)
 
 
+def print_line(text: str) -> None:
+    """Print a line as it is: without markup, colours or wrapping."""
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
 def print_json(value: Any) -> None:
     """Print a result for other programs to standard output."""
     print(json.dumps(value, indent=1, allow_nan=False))

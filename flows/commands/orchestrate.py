@@ -12,9 +12,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from scan2sim.flows.commands.app import App, Json
-from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, warn
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, print_line, warn
 from scan2sim.flows.commands.options import options
-from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, print_result, progress_lines, say
+from scan2sim.flows.commands.orchestrate_osm import operation, osm_client, print_result, progress_lines
 from scan2sim.flows.commands.orchestrate_sites import cluster as cluster_commands
 from scan2sim.flows.commands.orchestrate_sites import repo as repo_commands
 from scan2sim.flows.commands.orchestrate_sites import vim as vim_commands
@@ -148,7 +148,7 @@ def orchestrate_onboard(
                 errors.append(outcome)
             else:
                 onboarded.append(outcome.partition(" ")[2])
-                say(f"{outcome} is onboarded")
+                print_line(f"{outcome} is onboarded")
         for one in errors[:-1]:
             warn(str(one))
     if as_json:
@@ -284,7 +284,7 @@ def orchestrate_plan(params: Connection, services: Services, as_json: Json = Fal
     if as_json:
         print_json([asdict(one) for one in changes])
         return
-    console.print(_changes(changes)) if changes else say("nothing to do: all services are as described")
+    console.print(_changes(changes)) if changes else print_line("nothing to do: all services are as described")
 
 
 @app.command("apply")
@@ -318,7 +318,7 @@ def orchestrate_place(
         table.add_row(one.environment, "[green]fits" if one.fits else "[red]no", why)
     console.print(table)
     nearest = next((one for one in placements if one.fits), None)
-    say(f"nearest to the robot: {nearest.environment}" if nearest else "no site meets the requirements")
+    print_line(f"nearest to the robot: {nearest.environment}" if nearest else "no site meets the requirements")
 
 
 @app.command("page")
@@ -328,7 +328,7 @@ def orchestrate_page(params: PageParams) -> None:
     optional_deps.require("the page", "fastapi", "uvicorn", "prometheus_client")
     from scan2sim.services.orchestration.page import serve
 
-    serve(params, say)
+    serve(params, print_line)
 
 
 @app.command("pool")
@@ -375,7 +375,7 @@ def _print_result(result: ApplyResult, as_json: bool) -> None:
         print_json({"done": [asdict(one) for one in result.done], "failed": failed})
         return
     if not result.done and not result.failed:
-        say("nothing to do: all services are as described")
+        print_line("nothing to do: all services are as described")
         return
     table = Table("name", "", "")
     for change in result.done:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, progress, warn
+from scan2sim.flows.commands.display import console, messages_on_stderr, print_json, print_line, progress, warn
 from scan2sim.pipeline.core.step import Report
 from scan2sim.services.orchestration.settings import Connection, OperationParams
 
@@ -49,16 +49,11 @@ def progress_lines(title: str) -> Iterator[Report]:
         if message and message not in last:
             last.clear()
             last.add(message)
-            say(f"{title}: {message}")
+            print_line(f"{title}: {message}")
 
     yield report_line
 
 
-def say(text: str) -> None:
-    """Print a line as it is."""
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-
 def print_result(as_json: bool, text: str, **facts: Any) -> None:
     """Print the result of a single operation: as a line, or its facts as JSON."""
-    print_json(facts) if as_json else say(text)
+    print_json(facts) if as_json else print_line(text)

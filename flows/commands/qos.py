@@ -15,7 +15,7 @@ from rich.table import Table
 
 from scan2sim.flows.commands import qos_table
 from scan2sim.flows.commands.app import App, Json
-from scan2sim.flows.commands.display import console, progress
+from scan2sim.flows.commands.display import console, print_line, progress
 from scan2sim.flows.commands.options import options
 from scan2sim.flows.commands.qos_table import Out, or_dash
 from scan2sim.pipeline.core import optional_deps
@@ -106,7 +106,7 @@ def _measure_toolbox(params: MeasureParams, as_json: bool, out: Path | None) -> 
     required = service.of(params.environment)
     seconds, probe_rate = duration(params, required)
     if not as_json:
-        _say(f"measuring for {seconds:.0f} s, with {probe_rate:.0f} packets per second that probe the network")
+        print_line(f"measuring for {seconds:.0f} s, with {probe_rate:.0f} packets per second that probe the network")
     with progress(f"{params.service} {params.environment}") as report:
         measured = measure(params, service, report)
     needs = [resource_needs(measured, rate) for rate in IMAGE_RATES]
@@ -158,12 +158,12 @@ def qos_choose(params: ChoiceParams, as_json: Json = False) -> None:
         made = {kind: {**one, "agreement": kept[kind]} for kind, one in found.items()}
         print(json.dumps(qos_table.finite({**made, "detector": detector.info.name}), indent=1))
         return
-    _say(f"JPEGs{_jpeg_text(jpeg)}; {_agreement_text(kept['jpeg'])}")
-    _say(
+    print_line(f"JPEGs{_jpeg_text(jpeg)}; {_agreement_text(kept['jpeg'])}")
+    print_line(
         f"H.264: {stream.bitrate * 1e-6:.3g} Mbit/s for the encoder, at most {stream.megabits:.3g} on the wire; "
         f"{_agreement_text(kept['h264'])}"
     )
-    _say(f"agreement: F1 of the detections of {detector.info.name} relative to those in the original images")
+    print_line(f"agreement: F1 of the detections of {detector.info.name} relative to those in the original images")
 
 
 def _agreement_text(share: float) -> str:
@@ -182,7 +182,3 @@ def _needs_table(found: list[ResourceNeeds]) -> Table:
     for one in found:
         table.add_row(f"{one.rate:g}", or_dash(one.bandwidth), f"{one.cores:.2f}")
     return table
-
-
-def _say(text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.display import console, print_line
 from scan2sim.services.qos.compare import MetricComparison, passed, summary
 from scan2sim.services.qos.requirements import MACHINE_METRICS, NETWORK_METRICS, UNITS
 
@@ -64,7 +64,7 @@ def report(
         console.print(table(title, comparisons))
         outcomes = (("service", NETWORK_METRICS), ("machine", MACHINE_METRICS))
         for line in (*lines, *(f"{name}: {summary(comparisons, metrics)}" for name, metrics in outcomes)):
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            print_line(line)
     if out:
         out.write_text(text, encoding="utf-8")
 

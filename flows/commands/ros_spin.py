@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from scan2sim.flows.commands.display import console
+from scan2sim.flows.commands.display import print_line
 from scan2sim.services import transport
 from scan2sim.services.supervision import end_process_with_threads
 
@@ -23,7 +23,7 @@ def spin(create: Callable[[], Any], finished: Callable[[Any], bool] = lambda _: 
         try:
             with end_process_with_threads(), suppress(KeyboardInterrupt):
                 name = f"{node.get_namespace().rstrip('/')}/{node.get_name()}"
-                console.print(f"{name} is running (stop with Ctrl-C)", highlight=False, markup=False, soft_wrap=True)
+                print_line(f"{name} is running (stop with Ctrl-C)")
                 while not finished(node):
                     ros.spin_once(node, 0.2)
         finally:

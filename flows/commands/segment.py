@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from scan2sim.flows.commands.app import App, Config, Sets, TilePath, settings_of
-from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.commands.display import console, print_line, progress, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.run_with_progress import plan_and_run, show_warnings
 from scan2sim.flows.engine.lock import locked
@@ -138,8 +138,8 @@ def segment_tile(path: Path, out: Path, settings: Settings) -> None:
     show_warnings(done)
     console.print(json.dumps(done["segment"].metrics, indent=1), highlight=False, markup=False)
     if own is not None and done["segment"].metrics["source"] != "cloud" and done["segment"].metrics["own_classes"] > 0:
-        console.print(confusion(own, predicted).table(), highlight=False, markup=False, soft_wrap=True)
-    console.print(f"Clouds: {out / 'classified'}", highlight=False, soft_wrap=True, markup=False)
+        print_line(confusion(own, predicted).table())
+    print_line(f"Clouds: {out / 'classified'}")
 
 
 def _with_dropped(dropped: U8, own: U8 | None, predicted: U8, confidence: U8, source: U8) -> tuple[U8, U8, U8]:
@@ -233,7 +233,7 @@ def train_network(folder: Path, weights: Path, *, minutes: float, steps: int, se
         trained = train(folder, training_settings, report)
     save(trained.network, weights, {"recipe": str(training_settings), "iou": trained.iou})
     _print_iou(trained.iou)
-    console.print(f"Weights: {weights}", highlight=False, soft_wrap=True, markup=False)
+    print_line(f"Weights: {weights}")
 
 
 def evaluate(path: Path, out: Path, settings: Settings) -> None:

@@ -16,7 +16,7 @@ from rich.table import Table
 from scan2sim.flows.commands import qos_table
 from scan2sim.flows.commands.app import App, Json
 from scan2sim.flows.commands.browser import open_page
-from scan2sim.flows.commands.display import console, print_json, progress
+from scan2sim.flows.commands.display import console, print_json, print_line, progress
 from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.ros_spin import stop_on_signal
 from scan2sim.pipeline.core import optional_deps
@@ -110,8 +110,8 @@ def teleop_adapter(
     stop = threading.Event()
     with stop_on_signal(stop):
         server = AdapterServer(adapter.connect(settings), params)
-        _say(f"{name}: listens on {server.address[0]}:{server.address[1]}; Ctrl-C stops it")
-        server.run(stop, lambda news: _say(f"the vehicle {news}"))
+        print_line(f"{name}: listens on {server.address[0]}:{server.address[1]}; Ctrl-C stops it")
+        server.run(stop, lambda news: print_line(f"the vehicle {news}"))
 
 
 @app.command("gateway")
@@ -121,7 +121,7 @@ def teleop_gateway(params: GatewayParams) -> None:
     _require("fastapi", "uvicorn")
     from scan2sim.services.teleoperation.gateway.web import serve
 
-    serve(params, _say)
+    serve(params, print_line)
 
 
 @app.command("station")
@@ -134,7 +134,7 @@ def teleop_station(
     _require("fastapi", "uvicorn")
     from scan2sim.services.teleoperation.station.web import serve
 
-    serve(params, _say, window)
+    serve(params, print_line, window)
 
 
 @app.command("drivers")
@@ -167,7 +167,7 @@ def teleop_drivers(
     if add:
         expires = None if days is None else datetime.now(UTC) + timedelta(days=days)
         token = drivers.add(file, add, role, expires, login)
-        _say(f"token of {add}: {token}" if token else f"{add} signs in as {login}")
+        print_line(f"token of {add}: {token}" if token else f"{add} signs in as {login}")
     table = Table("driver", "role", "credential", "expires (UTC)")
     for one in drivers.read(file):
         expiry = "never" if one.expires is None else f"{one.expires:%Y-%m-%d %H:%M}"
@@ -182,7 +182,7 @@ def teleop_replay(params: ReplayParams) -> None:
     _require("fastapi", "uvicorn", "rosbags")
     from scan2sim.services.teleoperation.station.replay import serve
 
-    serve(params, _say)
+    serve(params, print_line)
 
 
 @app.command("export")
@@ -192,7 +192,7 @@ def teleop_export(params: ExportParams) -> None:
     _require("av", "rosbags")
     from scan2sim.services.teleoperation.station.export import export
 
-    _say(f"{export(params)} images in {params.out}")
+    print_line(f"{export(params)} images in {params.out}")
 
 
 @app.command("audit")
@@ -214,7 +214,7 @@ def teleop_audit(
     if found.damage:
         raise DataError(path, found.damage, "Compare it with a backup")
     if not as_json:
-        _say(f"{found.entries} entries, none was changed; SHA-256 of the newest: {found.head}")
+        print_line(f"{found.entries} entries, none was changed; SHA-256 of the newest: {found.head}")
 
 
 @app.command("vehicle")
@@ -226,7 +226,7 @@ def teleop_vehicle(params: VehicleParams) -> None:
 
     stop = threading.Event()
     with stop_on_signal(stop):
-        serve(params, stop, _say, _open_world)
+        serve(params, stop, print_line, _open_world)
 
 
 def _open_world(folder: Path) -> WorldCamera:
@@ -251,13 +251,13 @@ def teleop_demo(
     if window:
         app_window.browser()
     stop = threading.Event()
-    with stop_on_signal(stop), demo(params, _say) as running, ExitStack() as stack:
+    with stop_on_signal(stop), demo(params, print_line) as running, ExitStack() as stack:
         if window:
             stack.enter_context(app_window.window(running.page))
         elif browse:
             open_page(running.page)
         while not stop.wait(0.5):
-            running.supervise(_say)
+            running.supervise(print_line)
 
 
 @app.command("measure")
@@ -312,7 +312,3 @@ def measure_drive(params: MeasureParams, requirements_of: str, *, as_json: bool,
 
 def _require(*packages: str) -> None:
     optional_deps.require("teleop", *PACKAGES, *packages, extra="teleop")
-
-
-def _say(text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from scan2sim.flows.commands.app import App
-from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.commands.display import print_line, progress, warn
 from scan2sim.flows.commands.monitor import NODE_OPTIONS, Limits
 from scan2sim.flows.commands.options import assigned, options
 from scan2sim.flows.commands.ros_spin import spin
@@ -139,11 +139,11 @@ def toolbox_serve(
             from scan2sim.services.toolboxes.inference import grpc_server
 
             grpc_address = stack.enter_context(grpc_server.serving(engine, params, params.grpc_port))
-            _say(f"gRPC: {grpc_address}")
+            print_line(f"gRPC: {grpc_address}")
         if cameras:
             stack.callback(cameras.stop)
             cameras.start()
-        factory.run(served, params, lambda address: _say(f"{address}v2/models/{box}/infer; Ctrl-C stops it"))
+        factory.run(served, params, lambda address: print_line(f"{address}v2/models/{box}/infer; Ctrl-C stops it"))
 
 
 @app.command("node")
@@ -180,7 +180,7 @@ def _over_files(box: str, params: ToolboxParams, images: Path, out: Path, draw: 
     patient = params.model_copy(update={"deadline": offline.OFFLINE_DEADLINE_S})
     with closing(Engine(box, patient)) as engine, progress(box) as report:
         ended = offline.process_files(engine, images, out, report, draw=draw)
-    _say(f"{ended.pop(State.DONE, 0)} images: {out / offline.RESULTS_FILE}")
+    print_line(f"{ended.pop(State.DONE, 0)} images: {out / offline.RESULTS_FILE}")
     for state, count in ended.items():
         warn(f"{count} images were {state}; {out / offline.RESULTS_FILE} has the reasons")
 
@@ -194,7 +194,3 @@ def _params(box: str, assignments: list[str] | None) -> ToolboxParams:
     given = assigned(assignments or (), "threshold=0.4")
     kind = tasks.find(box).Params
     return kind.of(box, given, remedy=f"`scan2sim toolbox {box} --help` lists its settings")
-
-
-def _say(text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

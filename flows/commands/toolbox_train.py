@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scan2sim.data_samples import boxes
-from scan2sim.flows.commands.display import console, progress, warn
+from scan2sim.flows.commands.display import print_line, progress, warn
 from scan2sim.flows.commands.log import Log
 from scan2sim.flows.commands.run_with_progress import plan_and_run
 from scan2sim.flows.engine.lock import locked
@@ -77,7 +77,7 @@ def train_on_drives(
         with progress(f"labels ({kind})") as report:
             counts = drive_labels.write(labelled, CLASSES, folders[kind], report)
         if tiles:
-            _say(f"{kind}: {counts['images']} photos with {counts['boxes']} vehicles: {folders[kind]}")
+            print_line(f"{kind}: {counts['images']} photos with {counts['boxes']} vehicles: {folders[kind]}")
         if kind == "training" and not counts["boxes"]:
             raise InputError(drives[0], "no vehicles were found in the photos", "Give drives with photos and traffic")
     datasets = [folders["training"]]
@@ -95,7 +95,7 @@ def train_on_drives(
     export_thresholds(weights, figures.threshold if figures.recall else None)
     of = f"{len(held_out)} held-out drives" if held_out else "the drives of the training, as none are held out"
     if figures.recall:
-        _say(
+        print_line(
             f"{weights}: of {figures.vehicles} vehicles in {of}, {figures.recall:.0%} are detected with a precision of "
             f"{figures.precision:.0%}, at a score of {figures.threshold:.2f}"
         )
@@ -147,7 +147,3 @@ def export_thresholds(weights: Path, threshold: float | None) -> None:
     own = read_thresholds(INCLUDED_WEIGHTS)
     by_class = {} if threshold is None else {name: round(threshold, 3) for name in VEHICLES}
     write_thresholds(weights, own | by_class)
-
-
-def _say(text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -7,7 +7,7 @@ therefore judged by how much of its height has points, not by its normals.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -98,19 +98,13 @@ class Columns:
     Attributes:
         xy: (C, 2) mean position of their points.
         layers: (C,) number of layers with points.
-        top: (C,) height of their highest layer, metres.
-        of_point: (N,) column of each point.
         cell, layer: sizes, metres.
     """
 
     xy: F64
     layers: I64
-    top: F64
-    of_point: I64
     cell: float
     layer: float
-    normal: F64 = field(default_factory=lambda: np.zeros((0, 2)))
-    flat: Bools = field(default_factory=lambda: np.zeros(0, bool))
 
 
 def columns(xyz: F32, spacing: float) -> Columns:
@@ -122,10 +116,8 @@ def columns(xyz: F32, spacing: float) -> Columns:
     column = index[:, 0] * wide + index[:, 1]
     _, of_point, count = np.unique(column, return_inverse=True, return_counts=True)
     filled = np.unique(of_point * deep + index[:, 2]) // deep
-    top = np.full(len(count), -np.inf)
-    np.maximum.at(top, of_point, points[:, 2])
     mean = np.stack([np.bincount(of_point, points[:, k]) / count for k in range(2)], axis=1)
-    return Columns(mean, np.bincount(filled, minlength=len(count)), top, of_point, cell, layer)
+    return Columns(mean, np.bincount(filled, minlength=len(count)), cell, layer)
 
 
 def find_runs(found: Columns) -> list[Run]:

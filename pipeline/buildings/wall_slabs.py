@@ -46,8 +46,6 @@ class SlabModel:
     full_share: float = 0.3
     """Share of a wall's length that reaches most of the room's height, from which it ends at the ceiling."""
     full_height: float = 0.7
-    pane: float = 0.06
-    """Smallest depth of a pane or niche behind a wall's face."""
 
 
 MODEL = SlabModel()

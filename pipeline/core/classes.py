@@ -20,7 +20,9 @@ from scan2sim.pipeline.core.types import I64, U8, Bools
 
 Group = Literal["terrain", "building", "vegetation", "vehicle", "ceiling", "furniture"]
 GROUPS: tuple[Group, ...] = ("terrain", "building", "vegetation")
-INDOOR_GROUPS: tuple[Group, ...] = ("ceiling", "furniture")
+CEILING: Group = "ceiling"
+"""Surface that hides rooms from above: views from there omit it (`flows/reports/pages/walk.js` by this name, too)."""
+INDOOR_GROUPS: tuple[Group, ...] = (CEILING, "furniture")
 """Further surfaces of an indoor map; in other clouds their classes have no surface."""
 SURFACES: tuple[Group, ...] = (*GROUPS, "vehicle", *INDOOR_GROUPS)
 """All surfaces of a world: the groups, parked vehicles if `split.vehicles` keeps them, and those of indoor maps."""
@@ -89,13 +91,13 @@ FIRST_USER_CODE = 64
 
 def code_of(text: str) -> int | None:
     """Code of a class given by name ("Road sign"; case and spaces don't matter) or by code ("64"); None if unknown."""
-    plain = _plain(text)
+    plain = plain_name(text)
     return _codes_by_name().get(plain, int(plain) if plain in map(str, CODE.values()) else None)
 
 
 @cache
 def _codes_by_name() -> dict[str, int]:
-    return {_plain(name): code for name, code in (SYNONYMS | CODE).items()}
+    return {plain_name(name): code for name, code in (SYNONYMS | CODE).items()}
 
 
 def name_of(code: int) -> str:
@@ -194,7 +196,8 @@ def unmapped_codes_warning(count: npt.NDArray[np.integer], table: U8) -> str:
     )
 
 
-def _plain(text: str) -> str:
+def plain_name(text: str) -> str:
+    """Letters and digits of a name, in lower case: names are compared by them."""
     return "".join(c for c in text.lower() if c.isalnum())
 
 

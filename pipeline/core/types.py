@@ -128,7 +128,36 @@ class View:
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class _Stored:
+    """Arrays and a frame that are stored as an uncompressed .npz."""
+
+    def save(self, path: Path) -> None:
+        """Write as .npz."""
+        arrays: dict[str, Any] = {}
+        for f in fields(self):
+            part = getattr(self, f.name)
+            if isinstance(part, Frame):
+                arrays["frame"] = np.array([part.crs, repr(part.origin), repr(part.unit)])
+            elif part is not None:
+                arrays[STORED.get(f.name, f.name)] = part
+        with open(path, "wb") as file:
+            np.savez(file, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read what `save` wrote."""
+        with np.load(path) as data:
+            attribute = {stored: name for name, stored in STORED.items()}
+            arrays = {attribute.get(name, name): data[name] for name in data.files}
+        if "frame" in arrays:
+            crs, origin, unit = arrays.pop("frame").tolist()
+            x, y, z = (float(part) for part in origin.strip("()").split(","))
+            arrays["frame"] = Frame(crs, (x, y, z), float(unit))
+        return cls(**arrays)
+
+
+@dataclass(frozen=True)
+class Trajectory(_Stored):
     """The path of a scanner or a camera.
 
     Attributes:
@@ -167,15 +196,6 @@ class Trajectory:
         """
         moments = np.clip(np.asarray(times, np.float64), self.times[0], self.times[-1])
         return interpolate(self.poses, self.times, moments)
-
-    def save(self, path: Path) -> None:
-        """Write as .npz."""
-        _save(self, path)
-
-    @classmethod
-    def load(cls, path: Path) -> Trajectory:
-        """Read what `save` wrote."""
-        return _load(cls, path)
 
 
 @dataclass(frozen=True)
@@ -227,36 +247,12 @@ STORED = {"classification": "label"}
 """Attribute name: array name in a .npz, where they differ (compatibility with older files)."""
 
 
-def _save(value: Any, path: Path) -> None:
-    """Write a dataclass of arrays and a frame as an uncompressed .npz."""
-    arrays: dict[str, Any] = {}
-    for f in fields(value):
-        part = getattr(value, f.name)
-        if isinstance(part, Frame):
-            arrays["frame"] = np.array([part.crs, repr(part.origin), repr(part.unit)])
-        elif part is not None:
-            arrays[STORED.get(f.name, f.name)] = part
-    with open(path, "wb") as file:
-        np.savez(file, **arrays)
-
-
-def _load(cls: Any, path: Path) -> Any:
-    with np.load(path) as data:
-        attribute = {stored: name for name, stored in STORED.items()}
-        arrays = {attribute.get(name, name): data[name] for name in data.files}
-    if "frame" in arrays:
-        crs, origin, unit = arrays.pop("frame").tolist()
-        x, y, z = (float(part) for part in origin.strip("()").split(","))
-        arrays["frame"] = Frame(crs, (x, y, z), float(unit))
-    return cls(**arrays)
-
-
 UNCOLOURED = 128
 """Grey level (all channels) of points of unknown colour in a cloud that has colours."""
 
 
 @dataclass(frozen=True)
-class PointCloud:
+class PointCloud(_Stored):
     """Points in local coordinates with their attributes; absent attributes are None.
 
     Attributes:
@@ -321,18 +317,9 @@ class PointCloud:
             column("intensity"),
         )
 
-    def save(self, path: Path) -> None:
-        """Write as .npz."""
-        _save(self, path)
-
-    @classmethod
-    def load(cls, path: Path) -> PointCloud:
-        """Read what `save` wrote."""
-        return _load(cls, path)
-
 
 @dataclass(frozen=True)
-class Mesh:
+class Mesh(_Stored):
     """Triangles in local coordinates, oriented counter-clockwise seen from outside.
 
     Attributes:
@@ -397,15 +384,6 @@ class Mesh:
             page=None if self.page is None else self.page[mask],
             classification=None if self.classification is None else self.classification[mask],
         )
-
-    def save(self, path: Path) -> None:
-        """Write as .npz."""
-        _save(self, path)
-
-    @classmethod
-    def load(cls, path: Path) -> Mesh:
-        """Read what `save` wrote."""
-        return _load(cls, path)
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,7 @@ def in_free_space(
     voxel: float,
     max_range: float,
     votes: int,
-    low: float = -np.inf,
-    high: float = np.inf,
+    high: float,
 ) -> tuple[Bools, float]:
     """(N,) bool, True for points in free space; and the fraction of candidate points that were observed often enough.
 
@@ -61,12 +60,12 @@ def in_free_space(
         voxel: voxel size in metres; poses must be more accurate than this.
         max_range: maximum length of rays, metres: beyond it, angular errors may exceed a voxel.
         votes: number of windows in which a voxel must have been passed.
-        low, high: heights (local z, metres) between which points are classified.
+        high: height (local z, metres) below which points are classified.
     """
     first = np.flatnonzero(np.diff(windows, prepend=windows[:1] - 1))
     new_pass = np.append(False, np.diff(windows[first]) > PASS_GAP_WINDOWS)
     starts = np.append(first, len(xyz))
-    candidates = (xyz[:, 2] > low) & (xyz[:, 2] < high)
+    candidates = xyz[:, 2] < high
     path = origins[np.isfinite(origins[:, 0])]
     if not len(path):
         return np.zeros(len(xyz), bool), 0.0

@@ -88,7 +88,6 @@ class Upright:
         level_share, upright_share: shares of the flat surfaces that are level and upright.
         margin: rating of the direction minus that of the next best; below `MARGIN_MIN` it is ambiguous.
         sign_margin: evidence for the direction's sign; below `SIGN_MARGIN_MIN` up and down may be swapped.
-        sigma_deg: standard deviation of the direction, degrees.
     """
 
     up: F64
@@ -96,7 +95,6 @@ class Upright:
     upright_share: float
     margin: float
     sign_margin: float
-    sigma_deg: float
 
     @property
     def has_walls(self) -> bool:
@@ -136,12 +134,12 @@ def find_up(xyz: F32, origin: F64 | None = None) -> Upright | None:
         return None
     rated = sorted(((_rating(u, flat, points), tuple(u)) for u in _candidates(flat)), reverse=True)
     margin = rated[0][0] - rated[1][0] if len(rated) > 1 else 1.0
-    up, sigma = _refine(np.array(rated[0][1]), flat)
+    up = _refine(np.array(rated[0][1]), flat)
     evidence, doubtful = _sign(up, flat, points, np.zeros(3) if origin is None else origin)
     up = up if evidence >= 0 else -up
     cos = np.abs(flat.normal @ up)
     level, upright = _level(cos, 2 * MODEL.tolerance_deg), _upright(cos, 2 * MODEL.tolerance_deg)
-    return Upright(up, float(level.mean()), float(upright.mean()), margin, 0.0 if doubtful else abs(evidence), sigma)
+    return Upright(up, float(level.mean()), float(upright.mean()), margin, 0.0 if doubtful else abs(evidence))
 
 
 def rotation_to_z(up: F64) -> F64:
@@ -219,7 +217,7 @@ def _candidates(flat: _Flat) -> list[F64]:
         found += chosen
     refined: list[F64] = []
     for u in found:
-        u, _ = _refine(u, flat)
+        u = _refine(u, flat)
         if all(abs(u @ other) < math.cos(math.radians(MODEL.separation_deg / 2)) for other in refined):
             refined.append(u)
     return refined
@@ -274,13 +272,12 @@ def _layers(height: F64) -> float:
     return float(pairs[first] + others.max()) / len(height)
 
 
-def _refine(up: F64, flat: _Flat) -> tuple[F64, float]:
-    """Direction by iteratively reweighted least squares, and its standard deviation in degrees.
+def _refine(up: F64, flat: _Flat) -> F64:
+    """Direction by iteratively reweighted least squares.
 
     The sum of squared sines of walls' elevations and of floors' slopes is a quadratic form; its smallest eigenvector
     is the solution.
     """
-    sigma = 90.0
     for scale_deg in MODEL.refine_deg:
         cos = flat.normal @ up
         wall = np.arcsin(np.clip(np.abs(cos), 0, 1))
@@ -291,15 +288,9 @@ def _refine(up: F64, flat: _Flat) -> tuple[F64, float]:
             limit = MODEL.ground_share * wall_weight.sum() / max(float(floor_weight.sum()), 1e-9)
             floor_weight *= min(1.0, limit)
         A = (flat.normal * (wall_weight - floor_weight)[:, None]).T @ flat.normal
-        values, vectors = np.linalg.eigh(A)
-        solved = vectors[:, 0]
+        solved = np.linalg.eigh(A)[1][:, 0]
         up = solved if solved @ up >= 0 else -solved
-        total = float(wall_weight.sum() + floor_weight.sum())
-        residual = float((wall_weight * wall**2 + floor_weight * slope**2).sum()) / max(total, 1e-9)
-        # neighbouring normals share their points: as many independent ones as neighbourhoods fit into the surfaces
-        information = max(float(values[1] - values[0]), 1e-9) / MODEL.neighbours
-        sigma = math.degrees(math.sqrt(residual / information))
-    return up, sigma
+    return up
 
 
 def _sign(up: F64, flat: _Flat, points: F64, origin: F64) -> tuple[float, bool]:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
@@ -91,6 +92,11 @@ def check_data(path: Path) -> Path:
 def hidden(path: Path) -> bool:
     """Whether a file is hidden: macOS writes a `._NAME.SUFFIX` beside each file on exFAT and network drives."""
     return path.name.startswith(".")
+
+
+def natural_order(name: str) -> list[int | str]:
+    """Sort key of a file's name by which 2 comes before 10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def files(folder: Path) -> list[Path]:

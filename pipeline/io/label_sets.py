@@ -8,7 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.core.classes import CODE, FIRST_USER_CODE, UNCLASSIFIED, parse_mapping, unmapped_codes_warning
+from scan2sim.pipeline.core.classes import (
+    CODE,
+    FIRST_USER_CODE,
+    UNCLASSIFIED,
+    parse_mapping,
+    plain_name,
+    unmapped_codes_warning,
+)
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.types import U8
 
@@ -114,7 +121,7 @@ def parse_classes(text: str) -> dict[int, int]:
     Raises:
         SettingError: as `classes.parse_mapping`, or no data set has that name.
     """
-    named = next((one for one in LABEL_SETS if _plain(one.name) == _plain(text)), None)
+    named = next((one for one in LABEL_SETS if plain_name(one.name) == plain_name(text)), None)
     if named is None and text and "=" not in text:
         names = ", ".join(one.name for one in LABEL_SETS)
         raise SettingError("classes", f"{text[:40]!r} is no known data set", f"Name one of {names}, or write 65=noise")
@@ -130,7 +137,3 @@ def codes_warning(count: npt.NDArray[np.integer], table: U8) -> str:
     if not warning or known < MIN_KNOWN_SHARE * labelled.sum() or not (ground and plants):
         return warning
     return f"{warning}. They seem to be labels of SemanticKITTI: import with --classes SemanticKITTI"
-
-
-def _plain(name: str) -> str:
-    return "".join(c for c in name.lower() if c.isalnum())

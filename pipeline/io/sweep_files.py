@@ -69,11 +69,7 @@ def list_files(folder: Path, suffixes: Sequence[str] = SWEEP_SUFFIXES, what: str
     found = [p for p in inside if p.suffix.lower() in suffixes and not file_checks.hidden(p)]
     if not found:
         raise InputError(folder, f"contains no {what} ({' '.join(suffixes)})", f"Give the folder of the {what}")
-    return sorted(found, key=_natural_order)
-
-
-def _natural_order(path: Path) -> list[Any]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+    return sorted(found, key=lambda path: file_checks.natural_order(path.name))
 
 
 def read_sweep(path: Path) -> Sweep:

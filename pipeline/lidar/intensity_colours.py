@@ -30,7 +30,7 @@ MARKING_SIGMAS = (1.8, 3.6)
 """Contrast on the ground, in robust standard deviations, from which points turn white, and are white."""
 MARKING_RGB = (235, 235, 230)
 FOOT_M = 0.2
-"""Distance from what stands on a floor within which the floor's points may be its own."""
+"""Points of a floor at this distance or less from a wall or furniture may be points of the wall or furniture."""
 GROUND_RGB = (112, 112, 114)
 """Tint of the ground: asphalt; shape alone doesn't distinguish it from soil."""
 

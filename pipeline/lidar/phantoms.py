@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F32
 from scan2sim.pipeline.lidar.casting import Simulated
-from scan2sim.pipeline.lidar.range_errors import BAND_NAMES, FAR_EARLY_M, distance_band
+from scan2sim.pipeline.lidar.range_errors import BAND_NAMES, FAR_EARLY_M, distance_band, share
 from scan2sim.pipeline.lidar.unreturned import UnreturnedRays
 
 GROUND = "terrain"
@@ -63,15 +63,11 @@ def row(
     known = len(unreturned) > 0
     return {
         "rays": len(unreturned),
-        "ground": _share(ground) if known else None,
-        "surface": _share(same) if known else None,
-        "without_return": _share(where) if known else None,
+        "ground": share(ground) if known else None,
+        "surface": share(same) if known else None,
+        "without_return": share(where) if known else None,
         "phantom": round(float(phantom.sum() + early.sum()) / len(simulated), 4) if known and len(simulated) else None,
-        "by_surface": {name: _share(where[simulated == i]) if known else None for i, name in enumerate(names)},
-        "by_distance": {name: _share(where[band == i]) if known else None for i, name in enumerate(BAND_NAMES)},
+        "by_surface": {name: share(where[simulated == i]) if known else None for i, name in enumerate(names)},
+        "by_distance": {name: share(where[band == i]) if known else None for i, name in enumerate(BAND_NAMES)},
         "reason": reason,
     }
-
-
-def _share(chosen: npt.NDArray[np.bool_]) -> float | None:
-    return round(float(chosen.mean()), 4) if len(chosen) else None

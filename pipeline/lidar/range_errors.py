@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -39,11 +39,11 @@ def row(rays: Simulated) -> Row:
         "rays": len(hit),
         "median_m": _percentile(np.abs(error), 50),
         "p90_m": _percentile(np.abs(error), 90),
-        "early_20cm": _share(error < -EARLY_M),
-        "early_50cm": _share(error < -FAR_EARLY_M),
-        "late_50cm": _share(error > FAR_EARLY_M),
-        "missing": _share(~hit),
-        "near_surface": _share(rays.apart < SURFACE_RADIUS_M),
+        "early_20cm": share(error < -EARLY_M),
+        "early_50cm": share(error < -FAR_EARLY_M),
+        "late_50cm": share(error > FAR_EARLY_M),
+        "missing": share(~hit),
+        "near_surface": share(rays.apart < SURFACE_RADIUS_M),
     }
 
 
@@ -77,15 +77,10 @@ def distance_band(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.integer]:
     return np.digitize(ranges, BANDS_M) - 1
 
 
-def solid(rows: Mapping[str, Row], key: str) -> float | None:
-    """A share (`key`) over all rays that hit surfaces other than vegetation: ground, walls, furniture; None: no ray."""
-    parts = [(one[key], one["rays"]) for name, one in rows.items() if name != "vegetation" and one[key] is not None]
-    return sum(value * rays for value, rays in parts) / sum(rays for _, rays in parts) if parts else None
-
-
 def _percentile(values: npt.NDArray[np.floating], percent: float) -> float | None:
     return round(float(np.percentile(values, percent)), 4) if len(values) else None
 
 
-def _share(chosen: Bools) -> float | None:
+def share(chosen: Bools) -> float | None:
+    """Share of True; None of no values."""
     return round(float(chosen.mean()), 4) if len(chosen) else None

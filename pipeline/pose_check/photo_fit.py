@@ -79,12 +79,11 @@ class SmallPhoto:
 
 @dataclass(frozen=True)
 class Fit:
-    """Scores (P,) of the photos by term, NaN for photos without a pose, and the share (P,) of pixels with points."""
+    """Scores (P,) of the photos by term, NaN for photos without a pose."""
 
     consistency: F64
     edges: F64
     intensity: F64
-    covered: F64
 
     @property
     def score(self) -> F64:
@@ -172,17 +171,16 @@ def fit(photos: Sequence[SmallPhoto], cameras: Sequence[Camera], T: F64, cloud: 
         cloud: points, in local coordinates.
     """
     terms = np.full((3, len(photos)), np.nan)
-    covered = np.full(len(photos), np.nan)
     contrast: list[F32 | None] = [None] * len(photos)
     for k, photo in enumerate(photos):
         if np.isfinite(T[photo.index]).all():
-            terms[1:, k], covered[k], contrast[k] = _alone(photo, cameras[photo.index], T[photo.index], cloud)
+            terms[1:, k], contrast[k] = _alone(photo, cameras[photo.index], T[photo.index], cloud)
     seen = [k for k, values in enumerate(contrast) if values is not None]
     for k in seen:
         found = sorted((_consistency(contrast[k], contrast[j], photos[k]) for j in seen if j != k), reverse=True)
         best = [value for _, value in found[: LIMITS.partners]]
         terms[0, k] = float(np.mean(best)) if best else 0.0
-    return Fit(terms[0], terms[1], terms[2], covered)
+    return Fit(terms[0], terms[1], terms[2])
 
 
 @dataclass(frozen=True)
@@ -222,8 +220,8 @@ def rendered(photo: SmallPhoto, camera: Camera, T: F64, cloud: PointCloud) -> Re
     return Rendered(index[visible], column[visible], row[visible], distance[visible], shown, front)
 
 
-def _alone(photo: SmallPhoto, camera: Camera, T: F64, cloud: PointCloud) -> tuple[F64, float, F32]:
-    """Terms (2,) of edges and intensity, share of pixels with points, and contrast (N,) of the points; NaN: unseen."""
+def _alone(photo: SmallPhoto, camera: Camera, T: F64, cloud: PointCloud) -> tuple[F64, F32]:
+    """Terms (2,) of edges and intensity, and contrast (N,) of the points; NaN: unseen."""
     seen = rendered(photo, camera, T, cloud)
     contrast = np.full(len(cloud), np.nan, np.float32)
     contrast[seen.index] = photo.contrast[seen.row, seen.column]
@@ -235,7 +233,7 @@ def _alone(photo: SmallPhoto, camera: Camera, T: F64, cloud: PointCloud) -> tupl
     if cloud.intensity is not None and len(seen.index) > LIMITS.min_pixels:
         values, on = intensity_contrast(photo, cloud.intensity[seen.index].astype(np.float32), seen.column, seen.row)
         terms[1] = _correlation(values[on], photo.contrast[on])
-    return terms * share / (share + LIMITS.shrink_share), share, contrast
+    return terms * share / (share + LIMITS.shrink_share), contrast
 
 
 def _projected(camera: Camera, T: F64, xyz: F32) -> tuple[np.ndarray, np.ndarray, np.ndarray, F32]:

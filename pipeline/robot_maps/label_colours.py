@@ -13,27 +13,23 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from scan2sim.pipeline.core.classes import CODE, UNCLASSIFIED, code_of
+from scan2sim.pipeline.core.classes import CODE, code_of
 from scan2sim.pipeline.core.errors import SettingError
 from scan2sim.pipeline.core.types import F32, U8
+from scan2sim.pipeline.io import label_sets
 
 Legend = Mapping[tuple[int, int, int], int]
 """Class code by colour (red, green, blue)."""
+_COLOURS_OF_SEMANTIC_KITTI = {
+    0: (0, 0, 0), 10: (100, 150, 245), 11: (100, 230, 245), 13: (100, 80, 250), 15: (30, 60, 150), 16: (0, 0, 255),
+    18: (80, 30, 180), 30: (255, 30, 30), 31: (255, 40, 200), 32: (150, 30, 90), 40: (255, 0, 255),
+    44: (255, 150, 255), 48: (75, 0, 75), 49: (175, 0, 75), 50: (255, 200, 0), 51: (255, 120, 50), 52: (255, 150, 0),
+    60: (150, 255, 170), 70: (0, 175, 0), 71: (135, 60, 0), 72: (150, 240, 80), 80: (255, 240, 150), 81: (255, 0, 0),
+    99: (50, 255, 255),
+}  # fmt: skip
 SEMANTIC_KITTI: Legend = {
-    (0, 0, 0): UNCLASSIFIED,
-    **dict.fromkeys([(100, 150, 245), (100, 80, 250), (0, 0, 255), (80, 30, 180)], CODE["vehicle"]),  # car, bus, ...
-    **dict.fromkeys([(100, 230, 245), (30, 60, 150)], CODE["vehicle"]),  # bicycle, motorcycle
-    **dict.fromkeys([(255, 30, 30), (255, 40, 200), (150, 30, 90)], CODE["person"]),  # person and riders
-    **dict.fromkeys([(255, 0, 255), (255, 150, 255), (150, 255, 170)], CODE["road"]),  # road, parking, lane marking
-    (75, 0, 75): CODE["sidewalk"],
-    (175, 0, 75): CODE["terrain"],  # other ground
-    (150, 240, 80): CODE["terrain"],
-    **dict.fromkeys([(255, 200, 0), (255, 150, 0)], CODE["building"]),  # building, other structure
-    (255, 120, 50): CODE["wall_or_fence"],
-    **dict.fromkeys([(0, 175, 0), (135, 60, 0)], CODE["high_vegetation"]),  # vegetation, trunk
-    (255, 240, 150): CODE["pole"],
-    (255, 0, 0): CODE["road_sign"],
-    (50, 255, 255): UNCLASSIFIED,  # other object
+    colour: CODE[label_sets.SEMANTIC_KITTI.classes.get(label, "unclassified")]
+    for label, colour in _COLOURS_OF_SEMANTIC_KITTI.items()
 }
 LEGENDS: dict[str, Legend] = {"semantickitti": SEMANTIC_KITTI}
 """Built-in legends by name."""

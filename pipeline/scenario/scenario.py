@@ -11,8 +11,6 @@ from scan2sim.pipeline.tracking.tracks import Track
 
 EGO = "ego"
 """Category and name of the recording vehicle."""
-EGO_SIZE_M = (4.3, 1.8, 1.6)
-"""Length, width, height of a recording vehicle whose own size isn't known: a passenger car."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from scan2sim.pipeline.core.classes import CODE, SURFACES, colour_of
+from scan2sim.pipeline.core.classes import CEILING, CODE, SURFACES, colour_of
 from scan2sim.pipeline.core.step import Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F64, U8, Camera, Frame, Mesh, PointCloud, Trajectory
 from scan2sim.pipeline.io import sky
@@ -159,7 +159,7 @@ def without_ceilings(groups: Sequence[str], renderer: Renderer) -> Renderer:
     """Renderer of the bodies (one for each of `groups`) but the ceilings of rooms, which hide the rooms from above."""
     from scan2sim.pipeline.camera.renderer import Renderer
 
-    bodies = [body for group, body in zip(groups, renderer.bodies, strict=True) if group != "ceiling"]
+    bodies = [body for group, body in zip(groups, renderer.bodies, strict=True) if group != CEILING]
     return renderer if len(bodies) == len(groups) else Renderer(bodies, renderer.sky)
 
 

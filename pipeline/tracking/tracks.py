@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,6 @@ from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.types import F64, Frame
 
 Category = Literal["car", "van", "truck", "bus", "motorcycle", "cyclist", "pedestrian", "ego"]
-CATEGORIES: tuple[str, ...] = get_args(Category)
 FORMAT_VERSION = 1
 POSE_FIELDS = ("time", "x", "y", "z", "yaw", "sigma_m", "sigma_rad")
 """Columns of the poses in `tracks.json`."""

@@ -37,15 +37,7 @@ class ToolboxNode(Monitor):
         for topic in params.images:
             name = qualified(topic, self.get_namespace())
             self.create_subscription(kind, topic, partial(self._submit, name, params.compressed), IMAGES_QOS)
-        self._bus = Bus(
-            self,
-            BusParams(
-                kafka_bootstrap_servers=params.kafka_bootstrap_servers,
-                kafka_config=params.kafka_config,
-                records_topic=params.publisher_topic,
-                events_topic=params.events_topic,
-            ),
-        )
+        self._bus = Bus(self, BusParams.of_node(params, params.events_topic))
         self.create_timer(params.period, self._report_queue)
 
     def _submit(self, topic: str, compressed: bool, message: Any) -> None:

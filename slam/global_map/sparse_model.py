@@ -66,14 +66,12 @@ class Alignment:
     """Transform from odometry's world to that of the trajectory.
 
     Attributes:
-        R: (3, 3) rotation, applied before `shift`.
-        shift: (3,) translation, metres.
+        R: (3, 3) rotation.
         factor: (T - 1,) scale factors of the motions between poses.
         frame: coordinate frame of the result.
     """
 
     R: F64
-    shift: F64
     factor: F64
     frame: Frame
 

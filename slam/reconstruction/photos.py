@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -95,17 +94,12 @@ def _unread(folder: Path, names: Sequence[str]) -> tuple[str, str] | None:
 def _files(folder: Path, suffixes: Sequence[str]) -> list[str]:
     found = (path for path in folder.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
     names = (path.relative_to(folder) for path in found)
-    return sorted(
-        (name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts)), key=_natural
-    )
+    used = (name.as_posix() for name in names if not any(part.startswith(".") for part in name.parts))
+    return sorted(used, key=file_checks.natural_order)
 
 
 def _stem(name: str) -> str:
     return name.rpartition(".")[0].lower()
-
-
-def _natural(name: str) -> list[Any]:
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name)]
 
 
 def read_photos(folder: Path, report: Report) -> tuple[list[Photo], list[str]]:

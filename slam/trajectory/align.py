@@ -42,7 +42,7 @@ def aligned_trajectory(
     unit = float(np.median(factor)) if len(factor) else 1.0
     covariance = transformed(covariances(checkpoint, gps, unit, placed=gps is not None and georeference), R, unit)
     trajectory = Trajectory(times, positions, rotations, unsure, covariance)
-    return trajectory, Alignment(R, positions[0] - poses[0, :3, 3] @ R.T, factor, frame)
+    return trajectory, Alignment(R, factor, frame)
 
 
 def upright(poses: F64) -> F64:

@@ -9,7 +9,8 @@
   const MAX_STEP_HEIGHT = 0.6; // metres above the feet: higher surfaces are not walked onto
   const WALK_SPEED = 3.5; // metres per second; four times as fast with Shift
   const SKY_COLOUR = 0xc8d6e6;
-  const CEILINGS = 1; // layer of the ceilings of rooms, which would hide the rooms from above
+  const CEILING = "ceiling"; // `CEILING` of pipeline/core/classes.py: would hide rooms from above
+  const CEILINGS = 1; // layer of its meshes, which orbiting doesn't show
   const MOVES = {
     KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1],
     KeyA: [-1, 0], ArrowLeft: [-1, 0], KeyD: [1, 0], ArrowRight: [1, 0],
@@ -140,7 +141,7 @@
 
     // Add the meshes of a tile to the scene, and to the ground if they are `solid`.
     put(name, found, solid = true) {
-      for (const mesh of found) if (mesh.name.startsWith("ceiling")) mesh.layers.set(CEILINGS);
+      for (const mesh of found) if (mesh.name.startsWith(CEILING)) mesh.layers.set(CEILINGS);
       this.scene.add(...found);
       this.tiles.set(name, found);
       if (solid) this.grounds.set(name, new Ground(found));

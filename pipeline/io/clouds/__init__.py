@@ -1,8 +1,9 @@
 """Point cloud readers: one module per format (`pipeline.core.plugins`), selected by the file's suffix.
 
-A format's module has `SUFFIXES`, `read_header(path) -> (count, low, high, crs[, notes])`, `read(path, frame)` and
-`chunks(path, frame, size)`; if its files name classes, `class_names(path) -> (ours, names)`; and if its points
-have flags that the header doesn't count, `flags(path) -> (withheld, overlap)`.
+A format's module has `SUFFIXES`, `read_header(path) -> (count, low, high, crs[, notes])`, and `parts(path)`, its points
+in chunks (LAS instead: `read(path, frame)` and `chunks(path, frame, size)`); if its files name classes,
+`class_names(path) -> (ours, names)`; and if its points have flags that the header doesn't count,
+`flags(path) -> (withheld, overlap)`.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from scan2sim.pipeline.core import classes, plugins
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
 from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
-from scan2sim.pipeline.io import file_checks, foreign_files, mesh_files
-from scan2sim.pipeline.io.point_chunks import all_withheld
+from scan2sim.pipeline.io import file_checks, foreign_files, mesh_files, point_chunks
+from scan2sim.pipeline.io.point_chunks import Points, all_withheld
 
 CHUNK_POINTS = 2_000_000
 COPIED_SUFFIXES = (".las", ".laz", ".ply")
@@ -59,6 +60,22 @@ class Format(Protocol):
 
     Attributes:
         SUFFIXES: suffixes of its files, or whole file names.
+    """
+
+    SUFFIXES: tuple[str, ...]
+
+    def read_header(self, path: Path) -> tuple[Any, ...]:
+        """The fields of `Header`."""
+
+    def parts(self, path: Path) -> Iterator[Points]:
+        """All points in file order, in chunks."""
+
+
+class CloudFormat(Protocol):
+    """Interface of a format's module that makes clouds itself.
+
+    Attributes:
+        SUFFIXES: as in `Format`.
     """
 
     SUFFIXES: tuple[str, ...]
@@ -125,7 +142,10 @@ def read(path: Path, frame: Frame) -> PointCloud:
     Raises:
         InputError: missing, truncated, or of an unknown format. UnavailableError: its library isn't installed.
     """
-    cloud: PointCloud = _reader(path).read(path, frame)
+    reader = _reader(path)
+    if hasattr(reader, "parts"):
+        return point_chunks.read_all(path, reader.parts(path), frame)
+    cloud: PointCloud = reader.read(path, frame)
     return cloud
 
 
@@ -178,4 +198,9 @@ def chunks(path: Path, frame: Frame, size: int = CHUNK_POINTS) -> Iterator[Point
         InputError: missing, truncated (on reaching the end), or of an unknown format.
         UnavailableError: its library isn't installed.
     """
-    yield from _reader(path).chunks(path, frame, size)
+    reader = _reader(path)
+    if hasattr(reader, "parts"):
+        found = point_chunks.summary(path, reader.parts(path))
+        yield from point_chunks.read_chunks(reader.parts(path), found, frame, size)
+    else:
+        yield from reader.chunks(path, frame, size)

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io import file_checks, point_chunks
 from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
@@ -34,21 +34,16 @@ OPTIONAL_FIELDS = ("intensity", "timeStamp", "classification", COLOUR_INVALID)
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
     """Number of valid points of all scans, low and high corner, CRS as WKT or None, and notes."""
-    found = point_chunks.summary(path, _parts(path))
+    found = point_chunks.summary(path, parts(path))
     return found.count, found.low, found.high, _crs(path), found.notes
 
 
-def read(path: Path, frame: Frame) -> PointCloud:
-    """All scans' points in local coordinates."""
-    return point_chunks.read_all(path, _parts(path), frame)
+def parts(path: Path) -> Iterator[Points]:
+    """The points of all scans, in chunks.
 
-
-def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points in file order, at most `size` per chunk."""
-    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
-
-
-def _parts(path: Path) -> Iterator[Points]:
+    Raises:
+        InputError: not a readable E57 file.
+    """
     with closing(open_file(path)) as file:
         try:
             scans = file.root()["data3D"]

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
 from scan2sim.pipeline.core.optional_deps import require
-from scan2sim.pipeline.core.types import F64, Bools, Frame, PointCloud
+from scan2sim.pipeline.core.types import F64, Bools
 from scan2sim.pipeline.io import file_checks, point_chunks
 from scan2sim.pipeline.io.clouds import las
 from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
@@ -43,21 +43,17 @@ NODE_KEY = re.compile(r"\d{1,3}-\d{1,10}-\d{1,10}-\d{1,10}")
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
     """Number of points, low and high corner of the points (not of the octree), CRS as WKT or None, and notes."""
-    found = point_chunks.summary(path, _parts(path))
+    found = point_chunks.summary(path, parts(path))
     return found.count, found.low, found.high, _crs(path, _json(path)), found.notes
 
 
-def read(path: Path, frame: Frame) -> PointCloud:
-    """All nodes' points in local coordinates."""
-    return point_chunks.read_all(path, _parts(path), frame)
+def parts(path: Path) -> Iterator[Points]:
+    """The points of all nodes, coarse nodes first, in chunks.
 
-
-def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points, coarse nodes first, at most `size` per chunk."""
-    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
-
-
-def _parts(path: Path) -> Iterator[Points]:
+    Raises:
+        InputError: a node is missing or damaged, or the data type is unknown.
+        UnavailableError: zstandard isn't installed.
+    """
     info = _json(path)
     kind = info.get("dataType")
     if kind not in NODE_SUFFIXES:

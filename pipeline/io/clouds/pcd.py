@@ -23,7 +23,7 @@ import numpy.typing as npt
 from numba import njit
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import F64, U8, Frame, PointCloud
+from scan2sim.pipeline.core.types import F64, U8
 from scan2sim.pipeline.io import file_checks, label_sets, number_text, point_chunks
 from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
@@ -50,24 +50,19 @@ class _Header:
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
     """Number of finite points, low and high corner, no CRS (PCD has none), and notes."""
-    found = point_chunks.summary(path, _parts(path))
+    found = point_chunks.summary(path, parts(path))
     with open(path, "rb") as file:
-        names = _header(path, file).row.names or ()
+        names = _header(file).row.names or ()
     field = next((name for name in CLASSES if name in names), None)
     return found.count, found.low, found.high, None, (*label_sets.field_notes(field), *found.notes)
 
 
-def read(path: Path, frame: Frame) -> PointCloud:
-    """All points in local coordinates, with colour, intensity, class and time if the file has such fields."""
-    return point_chunks.read_all(path, _parts(path), frame)
+def parts(path: Path) -> Iterator[Points]:
+    """The points, in chunks; all at once if they are compressed.
 
-
-def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points in file order, at most `size` per chunk."""
-    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
-
-
-def _parts(path: Path) -> Iterator[Points]:
+    Raises:
+        InputError: the file is missing, truncated or damaged.
+    """
     for header, rows in _rows(path):
         yield _points(header, rows)
 
@@ -76,7 +71,7 @@ def _rows(path: Path) -> Iterator[tuple[_Header, npt.NDArray[Any]]]:
     """All points as structured arrays; fewer than declared is an error, and sizes are checked before allocation."""
     try:
         with open(path, "rb") as file:
-            header = _header(path, file)
+            header = _header(file)
             left = path.stat().st_size - header.start
             if header.data == "ascii":
                 for rows in _ascii(path, file, header):
@@ -95,7 +90,7 @@ def _rows(path: Path) -> Iterator[tuple[_Header, npt.NDArray[Any]]]:
         raise InputError(path, f"is not a readable PCD cloud ({error})", REMEDY) from None
 
 
-def _header(path: Path, file: BinaryIO) -> _Header:
+def _header(file: BinaryIO) -> _Header:
     entries: dict[str, list[str]] = {}
     while "DATA" not in entries:
         line = file.readline(MAX_LINE_BYTES)

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io import file_checks, label_sets, number_text, point_chunks
 from scan2sim.pipeline.io.point_chunks import READ_POINTS, Points
 
@@ -73,20 +73,10 @@ def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]
     """
     header = layout(path)
     faces = _faces_note(path, header.faces) if header.faces else ()
-    found = point_chunks.summary(path, _parts(path))
+    found = point_chunks.summary(path, parts(path))
     removed = header.count - found.count
     notes = (f"{removed:,} points with NaN coordinates removed",) if removed else ()
     return found.count, found.low, found.high, None, (*faces, *notes, *_label_notes(header), *found.notes)
-
-
-def read(path: Path, frame: Frame) -> PointCloud:
-    """All points in local coordinates, with colours, intensities and classes (`CLASSES`) if the file has them."""
-    return point_chunks.read_all(path, _parts(path), frame)
-
-
-def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points in file order, at most `size` per chunk, each chunk in a frame with its origin near its points."""
-    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
 
 
 def class_names(path: Path) -> tuple[bool, dict[int, str]]:
@@ -183,7 +173,7 @@ def _elements(path: Path, lines: list[list[str]]) -> list[tuple[str, int, list[t
     return found
 
 
-def _parts(path: Path) -> Iterator[Points]:
+def parts(path: Path) -> Iterator[Points]:
     """The vertices, in chunks.
 
     Raises:

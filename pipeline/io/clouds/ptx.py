@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io import file_checks, number_text, point_chunks
 from scan2sim.pipeline.io.point_chunks import Points
 
@@ -28,21 +28,11 @@ REMEDY = "Export it again, or as E57"
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
     """Number of points with a return, low and high corner, no CRS, and notes."""
-    found = point_chunks.summary(path, _parts(path))
+    found = point_chunks.summary(path, parts(path))
     return found.count, found.low, found.high, None, found.notes
 
 
-def read(path: Path, frame: Frame) -> PointCloud:
-    """All scans' points in local coordinates."""
-    return point_chunks.read_all(path, _parts(path), frame)
-
-
-def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points in file order, at most `size` per chunk."""
-    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
-
-
-def _parts(path: Path) -> Iterator[Points]:
+def parts(path: Path) -> Iterator[Points]:
     """The points of all scans, in chunks.
 
     Raises:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from scan2sim.pipeline.core.errors import InputError
-from scan2sim.pipeline.core.types import F64, Frame, PointCloud
+from scan2sim.pipeline.core.types import F64
 from scan2sim.pipeline.io import file_checks, number_text, point_chunks, tables, text_columns
 from scan2sim.pipeline.io.point_chunks import Points
 
@@ -38,21 +38,16 @@ class _Form:
 
 def read_header(path: Path) -> tuple[int, F64, F64, str | None, tuple[str, ...]]:
     """Number of points, low and high corner, no CRS, and how the columns were interpreted."""
-    found = point_chunks.summary(path, _parts(path))
+    found = point_chunks.summary(path, parts(path))
     return found.count, found.low, found.high, None, (*_form(path).notes, *found.notes)
 
 
-def read(path: Path, frame: Frame) -> PointCloud:
-    """All points in local coordinates, with the attributes of their columns."""
-    return point_chunks.read_all(path, _parts(path), frame)
+def parts(path: Path) -> Iterator[Points]:
+    """The points, in chunks.
 
-
-def chunks(path: Path, frame: Frame, size: int) -> Iterator[PointCloud]:
-    """The points in file order, at most `size` per chunk."""
-    return point_chunks.read_chunks(_parts(path), point_chunks.summary(path, _parts(path)), frame, size)
-
-
-def _parts(path: Path) -> Iterator[Points]:
+    Raises:
+        InputError: a line doesn't have the columns of the first ones.
+    """
     form = _form(path)
     has_header_line = form.has_header_line
     with open(path, "rb") as file:

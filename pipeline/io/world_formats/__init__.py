@@ -19,6 +19,7 @@ from typing import Any, Literal, Protocol
 
 from pydantic import Field
 
+from scan2sim.pipeline.core.classes import CEILING
 from scan2sim.pipeline.core.errors import DataError, ScanError, SettingError, SpaceError, from_exception
 from scan2sim.pipeline.core.parameters import is_reserved
 from scan2sim.pipeline.core.plugins import find, module, names
@@ -251,10 +252,6 @@ def _without_ceiling(tile: SceneTile) -> SceneTile:
     """The tile without its ceilings, unless it consists of nothing else."""
     groups = {group: figures for group, figures in tile.groups.items() if group != CEILING}
     return replace(tile, groups=groups) if groups else tile
-
-
-CEILING = "ceiling"
-"""Surface that Gazebo's world has as a model of its own."""
 
 
 def _check_reserved(scene: Scene) -> None:

@@ -16,13 +16,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from scan2sim.pipeline.core.classes import CEILING
 from scan2sim.pipeline.core.plugins import find
 from scan2sim.pipeline.core.step import Report
 from scan2sim.pipeline.io import world_formats
 from scan2sim.pipeline.io.file_checks import make_folder
 from scan2sim.pipeline.io.scenario_formats import gazebo_actors
 from scan2sim.pipeline.io.scenario_formats.actor_meshes import write_obj
-from scan2sim.pipeline.io.world_formats import CEILING, GAZEBO_VISUAL_FORMATS, SceneParams
+from scan2sim.pipeline.io.world_formats import GAZEBO_VISUAL_FORMATS, SceneParams
 from scan2sim.pipeline.io.worlds import sdf
 from scan2sim.pipeline.io.worlds.scene import BACKDROP, Scene, SceneTile, by_class
 from scan2sim.pipeline.io.worlds.scene_traffic import scenario_of

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from scan2sim.pipeline.core.step import Params
 from scan2sim.services.kafka import ClientConfig, Servers
+from scan2sim.services.monitoring.settings.monitor import MonitorParams
 from scan2sim.services.monitoring.settings.scaling import MAX_WORKERS, ScalingParams
 from scan2sim.services.transport.names import TopicName
 
@@ -23,6 +24,16 @@ class BusParams(Params):
     kafka_config: ClientConfig = None
     records_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of records.")] = "monitor_data"
     events_topic: Annotated[TopicName, Field(description="ROS 2 and Kafka topic of events.")] = "bus_events"
+
+    @classmethod
+    def of_node(cls, node: MonitorParams, events_topic: str) -> BusParams:
+        """Those of an instrumented node that sends and receives events, too."""
+        return cls(
+            kafka_bootstrap_servers=node.kafka_bootstrap_servers,
+            kafka_config=node.kafka_config,
+            records_topic=node.publisher_topic,
+            events_topic=events_topic,
+        )
 
 
 class ScaleParams(BusParams, ScalingParams):

@@ -40,15 +40,7 @@ class WorkerNode(Monitor):
         self._workers = LocalWorkers(self.queue, command, params.deadline)
         self._max_workers, self._with_text = params.max_workers, params.with_text
         self._sent: float | None = None
-        self._bus = Bus(
-            self,
-            BusParams(
-                kafka_bootstrap_servers=params.kafka_bootstrap_servers,
-                kafka_config=params.kafka_config,
-                records_topic=params.publisher_topic,
-                events_topic=params.events_topic,
-            ),
-        )
+        self._bus = Bus(self, BusParams.of_node(params, params.events_topic))
         self.drops.append(self._bus.dropped)
         self._bus.events.on("workers", self._scale)
         self._bus.start()

@@ -14,7 +14,6 @@ from scan2sim.services.toolboxes.detector.metrics import GroundTruth, Prediction
 from scan2sim.services.toolboxes.results import Body
 
 VEHICLES = ("car", "van", "bus", "truck")
-PEOPLE = ("person", "cyclist")
 MIN_HEIGHT_PX = 25.0
 """Smaller vehicles are ignored: KITTI's limit."""
 WANTED_PRECISION = 0.8

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 import trimesh
 
 from scan2sim.pipeline.scenario.scenario import Actor
 from scan2sim.pipeline.scenario.shapes import axles, parts
-from scan2sim.pipeline.tracking.tracks import CATEGORIES
+from scan2sim.pipeline.tracking.tracks import Category
 from tests.fakes import traffic
 
 SIZES = {
@@ -18,7 +20,7 @@ SIZES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("category", CATEGORIES)
+@pytest.mark.parametrize("category", get_args(Category))
 def test_shape_fills_its_box_and_stands_on_the_ground(category: str) -> None:
     size = SIZES[category]
     track = traffic.drive(1, category, size, (0.0, 1.0), 0.0, 0.0, 1.0)  # type: ignore[arg-type]
