@@ -43,8 +43,14 @@ class Drive:
         key_frame_requests: their times; `nacks`: times of NACKs.
     """
 
-    def __init__(self, key_lifetime: float = 1e9, plan: EncodingPlan | None = None, retransmits: bool = False) -> None:
-        """`retransmits`: NACKed packets are retransmitted."""
+    def __init__(
+        self,
+        key_lifetime: float = 1e9,
+        plan: EncodingPlan | None = None,
+        retransmits: bool = False,
+        keep_images: bool = True,
+    ) -> None:
+        """`retransmits`: NACKed packets are retransmitted; `keep_images`: `images` is filled."""
         self.now = 0.0
         self.keys = KeySchedule(self.now, key_lifetime)
         self.encoder = CameraEncoder(3, self.keys, encoders.find("pyav"))
@@ -61,6 +67,7 @@ class Drive:
             lambda: self.now,
         )
         self.nacks: list[float] = []
+        self._keep_images = keep_images
         self._retransmits, self._retransmitted = retransmits, list[tuple[float, list[bytes]]]()
 
     def _request_key_frame(self, camera: int) -> None:
@@ -79,7 +86,8 @@ class Drive:
             self.now = frame.captured / 1e9
             for key in self.keys.announced(self.now):
                 self.receiver.add_key(key)
-            self.images[frame.captured] = frame.image
+            if self._keep_images:
+                self.images[frame.captured] = frame.image
             packets = self.encoder.encode(frame, self.plan, self.now)
             while self._retransmitted and self._retransmitted[0][0] <= self.now:
                 packets = [*self._retransmitted.pop(0)[1], *packets]
