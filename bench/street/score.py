@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from scan2sim.pipeline.core.types import F64, I64, U8, Bools
-from scan2sim.texturing.evaluate import psnr
+from scan2sim.texturing.evaluate import psnr as psnr
 
 TRUTH = Path(__file__).with_name("truth.json")
 
