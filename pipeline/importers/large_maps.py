@@ -14,7 +14,7 @@ from scan2sim.pipeline.geometry.height_map import exact_point_spacing
 from scan2sim.pipeline.io import clouds as cloud_io
 
 MAX_POINTS = 20_000_000
-"""Maps with more points are thinned; the steps need about 0.2 GB of memory per million."""
+"""Maps with more points are thinned; the steps need up to 0.25 GB of memory per million."""
 GROWTH = 1.25
 """Factor by which cubes grow until half of `MAX_POINTS` are left."""
 HASH = (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
