@@ -15,6 +15,7 @@ from scan2sim.pipeline.core.errors import DataError, SettingError
 from scan2sim.pipeline.core.parameters import Coordinate
 from scan2sim.pipeline.core.step import Context, Done, Inputs, Params, Report, Step
 from scan2sim.pipeline.core.types import F32, F64, Bools, Mesh, PointCloud, Trajectory
+from scan2sim.pipeline.io.worlds.scene import NAVIGATION_FILE
 from scan2sim.pipeline.simulation import ground_origin
 
 MAX_CLOUD_POINTS = 10_000_000
@@ -25,8 +26,6 @@ NEAR_M = 0.5
 their nearest points took most of the step's time."""
 INTENSITY_SCALE = 257.0
 """Intensities of clouds (16 bits) per level of the PCD's, which are 0 to 255."""
-FOLDER_FILE = "navigation.json"
-"""In the step's folder: spawn pose and storeys in the frame "world", whose origin in the CRS is `world_origin_m`."""
 MAX_FLOAT32_M = 10_000.0
 """Coordinates above this are written as float64: float32 would round them to a millimetre."""
 SOFT = ("mesh.ceiling", "mesh.vegetation")
@@ -85,7 +84,8 @@ def navigation(inputs: Inputs, params: NavigationParams, out: Path, report: Repo
     The robot starts where the `path` begins, or else at the origin of its map. Intensities are those of the nearest
     points of `cloud` (optional), or its median where none is near. File: `navigation`, a folder with `map.yaml` and
     `map.pgm` (the storey of the start; others: `map_1` ...), `map.pcd` (only for robots' maps, in the map's frame and
-    unit), and `navigation.json`.
+    unit), and `navigation.json`: spawn pose and storeys in the frame "world", whose origin in the CRS is
+    `world_origin_m`.
 
     Without a floor that a robot fits on there are no maps and no pose, and a warning.
 
@@ -145,7 +145,7 @@ def _write_maps(
     body = {
         "frame": "world", "world_origin_m": list(origin), "spawn": spawn, "storeys": about, "band_m": asdict(band)
     }  # fmt: skip
-    (folder / FOLDER_FILE).write_text(json.dumps(body, indent=2) + "\n", encoding="utf-8")
+    (folder / NAVIGATION_FILE).write_text(json.dumps(body, indent=2) + "\n", encoding="utf-8")
     return {"storeys": about, "spawn": spawn, "resolution_m": round(found[0].grid.cell, 4)}
 
 

@@ -19,8 +19,8 @@ from scan2sim.pipeline.io import sky
 from scan2sim.pipeline.io import views as views_io
 from scan2sim.pipeline.io.images import image
 from scan2sim.pipeline.io.images.album import Album
+from scan2sim.pipeline.io.worlds.scene import NAVIGATION_FILE
 from scan2sim.pipeline.simulation.robot import ROBOT
-from scan2sim.pipeline.steps.navigation import FOLDER_FILE
 
 if TYPE_CHECKING:
     from scan2sim.pipeline.camera.renderer import Image, Renderer
@@ -195,7 +195,7 @@ def robot_pose(navigation: Path, frame: Frame) -> F64 | None:
     """
     from scan2sim.pipeline.camera.renderer import look_at
 
-    file = navigation / FOLDER_FILE
+    file = navigation / NAVIGATION_FILE
     if not file.exists():
         return None
     about = json.loads(file.read_text(encoding="utf-8"))
